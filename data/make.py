@@ -29,14 +29,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import Clip, save_clip
-from fitting.datasets.synthetic import multi_limb, terrain_meshes, walker
-from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
-from fitting.datasets.synthetic.walker import WalkStyle
-from fitting.datasets.terrain import mesh_files
-from fitting.experiments import systems
+from fitting.clips import Clip, clip_frames, save_clip
+from fitting.experiment import systems
+from fitting.ground import meshes
 from fitting.runtime.precision import in_float64
+from fitting.synthetic import multi_limb, terrain_meshes, walker
+from fitting.synthetic.walker import Slide, Slip, Stop, WalkStyle
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
@@ -250,12 +248,12 @@ def make(folder: Path) -> None:
     terrains.mkdir(parents=True, exist_ok=True)
     clips.mkdir(parents=True, exist_ok=True)
     for name, mesh in TERRAINS.items():
-        mesh_files.save_mesh(terrains / f"{name}.ply", *mesh())
+        meshes.save_mesh(terrains / f"{name}.ply", *mesh())
     flat_animations = {name: flat_animation(name) for name in FLAT_ANIMATIONS}
     for name, flat in flat_animations.items():
         save_clip(clips / f"{name}_base.npz", flat)
     for reference in REFERENCES:
-        terrain = mesh_files.load_terrain(terrains / f"{reference.base}.ply")
+        terrain = meshes.load_terrain(terrains / f"{reference.base}.ply")
         motion = reference_motion(reference, flat_animations[reference.base], terrain)
         save_clip(clips / f"{reference.name}.npz", rounded(with_noise(motion, reference.seed)))
         truth = clips / f"{reference.name}_truth.toml"

@@ -19,10 +19,8 @@ import jax
 import pytest
 from matplotlib.figure import Figure
 
-from fitting.cli.terminal import plain_lines
-from fitting.runtime import xla
-from fitting.runtime.parallel import beside
-from fitting.runtime.storage import compiled_programs
+from fitting.cli import terminal
+from fitting.runtime import beside, cache_folder, xla
 from support.pages import save_pixel
 
 xla.configure_xla()  # as the commands do
@@ -38,13 +36,13 @@ os.environ.setdefault(PROGRAMS, str(KEPT_PROGRAMS))
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
-compiled_programs.write_complete_files()  # what one process writes another may read
+cache_folder.write_complete_files()  # what one process writes another may read
 
 # Some tests send themselves what Ctrl-C does, which shells have jobs in the background ignore.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What commands print must not depend on how fast they are.
-plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")
+terminal.PATIENCE = terminal.INTERVAL = terminal.SILENCE = float("inf")
 
 # Each test process would start others to draw in, only to draw small pictures.
 beside.cpu_count = lambda: 1

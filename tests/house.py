@@ -18,7 +18,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxik", "fitting")
 MANY_ARGUMENTS = 6
-MODULE_LINES = (21, 350)
+FEW_MODULES = 3
+SUBJECTS = (  # words in the paths of the modules of a study
+    "ablat", "calibrat", "compar", "draft", "many", "population", "sampl", "suite", "terrain",
+    "translat",
+)  # fmt: skip
+LIMITS = {  # of packages
+    "fitting": {"modules": (0, 190), "folders": (0, 28), "modules with one importer": (0, 60)},
+}
 NO_LIMITS = (-math.inf, math.inf)
 HELP = "from fitting.cli.main import main; main(['--help'])"
 
@@ -106,12 +113,60 @@ def names_any(node: ast.AST) -> bool:
     return "Any" in (getattr(node, key, None) for key in ("id", "attr", "name"))
 
 
+def importers(package: Package) -> dict[Path, set[Path]]:
+    """The modules of a package, each with those files of the package that import it."""
+    by_name = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in package.files
+    }
+    by_name = {name.removesuffix(".__init__"): path for name, path in by_name.items()}
+    users: dict[Path, set[Path]] = {path: set() for path in package.modules}
+    for path, tree in package.trees.items():
+        for name in imported_names(path, tree):
+            parent = name.rpartition(".")[0]
+            imported = by_name.get(name) or by_name.get(parent)
+            if imported in users and imported != path:
+                users[imported].add(path)
+    return users
+
+
+def imported_names(path: Path, tree: ast.Module) -> set[str]:
+    """Absolute dotted names of everything that a module imports."""
+    folders = path.relative_to(ROOT).parent.parts
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = folders[: len(folders) - node.level + 1] if node.level else ()
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def import_lines(tree: ast.Module) -> int:
+    """Number of lines that import statements take."""
+    statements = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    return sum((node.end_lineno or node.lineno) - node.lineno + 1 for node in statements)
+
+
+def scattered_subjects(package: Package) -> list[str]:
+    """Studies whose modules lie in more than two folders."""
+    homes = {word: set() for word in SUBJECTS}
+    for path in package.modules:
+        for word in SUBJECTS:
+            if word in path.relative_to(ROOT).as_posix():
+                homes[word].add(path.parent)
+    return [word for word, folders in homes.items() if len(folders) > 2]
+
+
 def package_figures(name: str) -> list[Figure]:
     """What follows from the source of a package alone."""
     package = Package(name)
     lines = sum(map(line_count, package.files))
     folders = Counter(path.parent for path in package.modules)
-    fullest, most_modules = folders.most_common(1)[0]
+    small = [folder.name for folder, count in folders.items() if count <= FEW_MODULES]
+    alone = [path for path, users in importers(package).items() if len(users) == 1]
+    scattered = scattered_subjects(package)
     modules = sorted(package.modules, key=line_count)
     lengths = {node: (node.end_lineno or 0) - node.lineno + 1 for node in package.functions}
     longest = max(lengths, key=lengths.__getitem__)
@@ -121,14 +176,23 @@ def package_figures(name: str) -> list[Figure]:
     percent_crowded = 100 * len(crowded) / len(lengths)
     percent_documented = 100 * (1 - len(undocumented) / len(public))
     any_per_thousand = 1000 * sum(map(names_any, package.nodes)) / lines
+    percent_imports = 100 * sum(map(import_lines, package.trees.values())) / lines
+    limits = LIMITS.get(name, {})
 
     def extreme(path: Path) -> tuple[int, tuple[float, float], str]:
-        return line_count(path), MODULE_LINES, path.relative_to(ROOT).as_posix()
+        return line_count(path), NO_LIMITS, path.relative_to(ROOT).as_posix()
+
+    def limited(figure: str, value: int, place: str = "") -> Figure:
+        return Figure(figure, value, limits.get(figure, NO_LIMITS), place)
 
     return [
-        Figure("modules", len(modules)),
-        Figure("modules in the fullest folder", most_modules, (1, 12), fullest.name),
+        limited("modules", len(modules)),
+        limited("folders", len(folders)),
+        Figure(f"folders of {FEW_MODULES} modules or fewer", len(small), place=" ".join(small)),
+        limited("modules with one importer", len(alone)),
+        Figure("subjects in more than two folders", len(scattered), place=" ".join(scattered)),
         Figure("lines", lines),
+        Figure("% of lines that import", percent_imports),
         Figure("lines of the shortest module", *extreme(modules[0])),
         Figure("lines of the longest module", *extreme(modules[-1])),
         Figure("lines of a function, median", statistics.median(lengths.values())),
@@ -138,6 +202,14 @@ def package_figures(name: str) -> list[Figure]:
         Figure("`Any` per thousand lines", any_per_thousand, (0, 5)),
         Figure("% of public names with a docstring", percent_documented, (100, 100)),
     ]
+
+
+def folder_figures(name: str) -> list[Figure]:
+    """The lines of each folder of a package."""
+    lines: Counter[Path] = Counter()
+    for path in Package(name).files:
+        lines[path.parent] += line_count(path)
+    return [Figure(f"lines of {folder.relative_to(ROOT)}", n) for folder, n in lines.items()]
 
 
 def readme_figure() -> Figure:
@@ -159,7 +231,7 @@ def help_figure() -> Figure:
 
 def main() -> int:
     """Prints all figures; gives 1 if one misses its limit, else 0."""
-    sections = {name: package_figures(name) for name in PACKAGES}
+    sections = {name: package_figures(name) + folder_figures(name) for name in PACKAGES}
     sections["for the user"] = [readme_figure(), help_figure()]
     for title, figures in sections.items():
         print(title, *figures, "", sep="\n")

@@ -13,17 +13,17 @@ ROOT = house.ROOT
 WINGS = {  # in import order: a wing may import those before it
     "jaxik": ["batching", "maths", "world", "solvers", "stages", "pipeline", "presets", "record"],
     "fitting": [
-        "runtime", "datasets", "problem", "inference", "analysis", "experiments", "studies",
-        "report", "viewer", "jobs", "bench", "cli",
+        "runtime", "clips", "ground", "synthetic", "problem", "inference", "motion", "experiment",
+        "report", "studies", "viewer", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
 STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "separation"]
 STAGES += ["pelvis", "effector", "fade", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
 ONLY_IMPORTED_BY = {
-    "trimesh": "fitting/datasets/terrain/mesh_files.py",
-    "optimistix": "fitting/inference/optimisation/levenberg_marquardt.py",
-    "emcee": "fitting/inference/sampling/sampler.py",
+    "trimesh": "fitting/ground/meshes.py",
+    "optimistix": "fitting/inference/optimise/levenberg_marquardt.py",
+    "emcee": "fitting/inference/sample/sampler.py",
 }
 
 
@@ -45,16 +45,7 @@ def name_of(path: Path) -> str:
 @functools.cache
 def imports(path: Path) -> set[str]:
     """Absolute dotted names of everything that a module imports."""
-    folders = path.relative_to(ROOT).parent.parts
-    names = set()
-    for node in ast.walk(trees()[path]):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            parents = folders[: len(folders) - node.level + 1] if node.level else ()
-            base = ".".join([*parents, *([node.module] if node.module else [])])
-            names |= {f"{base}.{alias.name}" for alias in node.names}
-    return names
+    return house.imported_names(path, trees()[path])
 
 
 def imported_packages(path: Path) -> set[str]:

@@ -11,11 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import Clip, contacts, load_clip, save_clip
-from fitting.datasets.synthetic import terrain_meshes
-from fitting.datasets.terrain import mesh_files
-from fitting.experiments import experiment_files, systems
+from fitting.clips import Clip, clip_frames, contacts, load_clip, save_clip
+from fitting.experiment import experiment_files, systems
+from fitting.ground import meshes
+from fitting.synthetic import terrain_meshes
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
@@ -43,7 +42,7 @@ def base_of(walk: str) -> Clip:
 
 def ground_of(name: str, up=(0.0, 1.0, 0.0)) -> terrain.Terrain:
     """A terrain as it is shipped."""
-    return mesh_files.load_terrain(DATA / "terrains" / f"{name}.ply", up=up)
+    return meshes.load_terrain(DATA / "terrains" / f"{name}.ply", up=up)
 
 
 cast = jax.jit(terrain.cast)
@@ -60,7 +59,7 @@ def cast_down(ground, points, up=(0.0, 1.0, 0.0)):
 
 def test_terrains_and_true_parameters_are_generated_again_to_the_byte(make, tmp_path):
     for name, mesh in make.TERRAINS.items():
-        mesh_files.save_mesh(tmp_path / f"{name}.ply", *mesh())
+        meshes.save_mesh(tmp_path / f"{name}.ply", *mesh())
     shipped = {path.name: path.read_bytes() for path in (DATA / "terrains").iterdir()}
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == shipped
     for reference in make.REFERENCES:

@@ -26,8 +26,8 @@ from sybil import Example, Sybil
 from sybil.parsers import markdown
 
 from fitting.cli.parser import make_parser
-from fitting.datasets.clips import load_clip
-from fitting.experiments import experiment_files, track_files
+from fitting.clips import load_clip
+from fitting.experiment import experiment_files, track_files
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("jaxik", "fitting", "data", "tests", "notebooks")

@@ -26,21 +26,19 @@ from matplotlib.figure import Figure
 import fitting
 import jaxik
 from fitting import jobs
-from fitting.analysis import playback
 from fitting.cli import main, progress
-from fitting.experiments import problems
+from fitting.experiment import problems
 from fitting.inference.identifiability import assess_identifiability
-from fitting.inference.optimisation import search
+from fitting.inference.optimise import search
 from fitting.inference.profiles import profiling
-from fitting.inference.sampling import posterior
-from fitting.inference.sampling.posterior import Posterior
-from fitting.report import fit_report, posterior_report
-from fitting.report.identifiability import sections
-from fitting.report.page import rendering
+from fitting.inference.sample import posterior
+from fitting.inference.sample.posterior import Posterior
+from fitting.motion import playback
+from fitting.report import pages
 from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
-from fitting.studies import assess, run_folder
-from fitting.studies.posterior import replay
+from fitting.studies.fit import assess, fit_jobs, fit_report, identifiability_report, run_folder
+from fitting.studies.sample import posterior_report, replay
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import CLIP, ROOT, write
@@ -67,8 +65,8 @@ FIT_WORK = [
     ("Playing the clips with the fitted system", PLAY),
     ("Drawing the curves of the parameters", (fit_report, "_draw_search")),
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
-    ("Measuring where limits are in effect", (fit_report.limit_activity, "measure"), PLAY),
-    ("Finding what determines 2 parameters", (sections, "find_evidence"), PLAY),
+    ("Measuring where limits are in effect", (fit_report.playback, "measure"), PLAY),
+    ("Finding what determines 2 parameters", (identifiability_report, "find_evidence"), PLAY),
     ("Writing the page", (fit_report.fit_page, "write")),
     ("Finishing the pictures",),
 ]
@@ -184,12 +182,12 @@ def interrupt(*_, **__) -> Any:
 
 def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
     """The names in its experiment are no paths."""
-    summary, page = done.run / run_folder.SUMMARY, done.run / rendering.PAGE
+    summary, page = done.run / run_folder.SUMMARY, done.run / pages.PAGE
     assert done.fitted.run == done.run
     assert done.log[0].startswith("fitting 2 parameters of record to 1 clip")
     assert done.log[-1] == f"written to {done.run}; read {summary}, or open {page} in a browser"
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
-    names |= {rendering.PAGE, "base.npz", "fitted.npz", "motion.png", "cost.png"}
+    names |= {pages.PAGE, "base.npz", "fitted.npz", "motion.png", "cost.png"}
     assert names <= tree(done.run)
     numbers = numbers_of(done.run)
     assert numbers["converged"] and numbers["experiment"] == NAME
@@ -243,13 +241,13 @@ def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(done, run):
 
 def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(run, monkeypatch):
     worse = worsen(run)
-    monkeypatch.setattr(jobs.fits, "assess_solution", interrupt)
+    monkeypatch.setattr(fit_jobs, "assess_solution", interrupt)
     fitting.sample(run)
     assert numbers_of(run) == worse and (run / run_folder.LOWER_POINT).is_file()
 
 
 def test_a_replay_that_is_interrupted_leaves_the_report_of_the_chain(done, run, monkeypatch):
-    monkeypatch.setattr(jobs.fits, "replay", interrupt)
+    monkeypatch.setattr(fit_jobs, "replay", interrupt)
     sampled = fitting.sample(dataclasses.replace(done.fitted, run=run))
     assert sampled.interrupted and (run / run_folder.POSTERIOR).is_file()
     assert "## Posterior" in (run / run_folder.SUMMARY).read_text()
@@ -274,7 +272,7 @@ IN_A_PROCESS_OF_32_BITS = """
 import json, sys
 import jax.numpy as jnp
 import fitting
-from fitting.experiments import problems
+from fitting.experiment import problems
 from support import quick
 
 problems.residuals_of_scenes = quick.residuals_of_scenes
@@ -368,7 +366,7 @@ def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
 
 
 def test_an_interrupt_before_the_search_writes_nothing(done, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(jobs.fits, "load_clips", interrupt)
+    monkeypatch.setattr(fit_jobs, "load_clips", interrupt)
     words = ["fit", str(done.experiment), "-o", str(tmp_path / "run")]
     assert main.main(words) == main.INTERRUPTED
     assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)
@@ -413,7 +411,7 @@ def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
     assert len(chain_of(run)) == 100
 
 
-@pytest.mark.filterwarnings("ignore::fitting.report.placement_report.PlacementWarning")
+@pytest.mark.filterwarnings("ignore::fitting.studies.animations.placement_report.PlacementWarning")
 def test_apply_runs_the_fitted_system_on_another_clip(done, animation, tmp_path, capsys):
     out = tmp_path / "out.npz"
     words = [done.run, animation.clip, "--terrain", animation.terrain, "-o", out]

@@ -2,7 +2,7 @@
 
 Each benchmark is timed next to comparable programs and to the limits of the machine: memory
 bandwidth, arithmetic and dispatch. It says nothing about the quality of a motion; for that see
-`fitting.analysis`.
+`fitting.motion`.
 
 Start with `suite`, the list of benchmarks. Each is a function in `benchmarks/` that fills a
 `measurement.Measurement`; `runner` calls them in turn, `report` writes what they measured.

@@ -5,21 +5,37 @@ Programs are compiled ahead of time, and compiling is timed separately. Calls th
 in turns, in random order, so that other load on the machine affects all of them.
 """
 
+import dataclasses
+import math
 import os
+import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from pathlib import Path
+from typing import TypeAlias, TypedDict
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from fitting.runtime import cache_folder, xla
+from fitting.runtime.threads import usable_cores
+
 from .roofline import Work, lower_bound, work_of_program
+from .workloads import Sizes
 
 SAMPLE = 0.2  # s, shortest sample: a faster call is repeated within it
 Call: TypeAlias = Callable[[], object]  # returns once its result is there
+
+STATUS = Path("/proc/self/status")
+MEMORY = Path("/proc/meminfo")
+CPU = Path("/proc/cpuinfo")
+
+# What a machine that is too small, or another process, does to a benchmark; the others go on.
+FAILURES = (MemoryError, jax.errors.JaxRuntimeError, subprocess.CalledProcessError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,3 +271,167 @@ def _cpu_seconds() -> float:
     """CPU time, s, of all threads of this process and of the child processes it waited for."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
+
+
+class Hardware(TypedDict):
+    """The machine, as the JSON report holds it."""
+
+    cpu: str
+    cores: int | None
+    vector_bits: int | None
+    threads: int
+    """Used."""
+    memory_gb: float | None
+    device: str
+    jax: str
+    jaxlib: str
+    python: str
+    xla_flags: str
+
+
+def hardware() -> Hardware:
+    """The hardware and software of this process."""
+    device = jax.devices()[0]
+    return {
+        "cpu": _system_entry(CPU, "model name") or platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "vector_bits": xla.vector_bits(),
+        "threads": usable_cores(),
+        "memory_gb": _memory_gb(),
+        "device": f"{device.platform}: {device.device_kind}",
+        "jax": jax.__version__,
+        "jaxlib": xla.jaxlib_version(),
+        "python": platform.python_version(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def time_in_width() -> float:
+    """Factor of the times that kernels aim at, which are set for vectors of 256 bits.
+
+    Vectors of twice the width take 0.7 of the time, the square root of a half: what goes through
+    caches and calls does not get faster.
+    """
+    return math.sqrt(256 / (xla.vector_bits() or 256))
+
+
+def _memory_gb() -> float | None:
+    """All memory of the machine; None where the system does not report it."""
+    entry = _system_entry(MEMORY, "MemTotal")
+    return float(entry.split()[0]) / 1e6 if entry else None
+
+
+def _system_entry(path: Path, key: str) -> str:
+    """The first entry of a key in a system file; empty where there is no such file or key."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
+
+
+def load_average() -> float:
+    """Load average over the last minute; NaN where the system does not report it."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+
+
+def reset_peak_memory() -> None:
+    """Restarts the record of peak resident memory, where the system allows it."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        pass  # then the peak counts from the start of the process
+
+
+def peak_memory_mb() -> float:
+    """Peak memory, MB; NaN where the system does not report it.
+
+    That of the device since the process started, where the device reports it; otherwise resident
+    memory since `reset_peak_memory`.
+    """
+    if statistics := jax.devices()[0].memory_stats():
+        return statistics.get("peak_bytes_in_use", float("nan")) / 1e6
+    peak = _system_entry(STATUS, "VmHWM")
+    return float(peak.split()[0]) / 1e3 if peak else float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """Something to be measured, and how."""
+
+    title: str
+    floats: str
+    """Float32, float64, or empty where the figures differ or have none."""
+    measure: Callable[[Measurement, Sizes], None]
+    x64: bool = False
+    """Whether JAX's 64-bit types are enabled meanwhile."""
+    long: bool = False
+    """Left out of a quick run, unless it is named."""
+
+
+@dataclasses.dataclass
+class Report:
+    """All that was measured."""
+
+    quick: bool
+    measurements: list[Measurement] = dataclasses.field(default_factory=list)
+    interrupted: bool = False
+
+
+def run_benchmarks(
+    benchmarks: Mapping[str, Benchmark],
+    sizes: Sizes,
+    quick: bool,
+    announce: Callable[[str], None],
+    progress: Callable[[str], None] = lambda text: None,
+) -> Report:
+    """Measures benchmarks one after another; an interrupt ends it and keeps what was measured.
+
+    Args:
+        benchmarks: by name.
+        sizes: of the workloads.
+        quick: whether these are the small sizes, for the report.
+        announce: called with a line at the start and at the end of each benchmark.
+        progress: called with what is being done within a benchmark.
+    """
+    report, ceilings = Report(quick), {}
+    cached = cache_folder.setting(cache_folder.ENABLED)
+    # With a cache, the second run of a benchmark would not compile.
+    jax.config.update(cache_folder.ENABLED, False)
+    try:
+        for number, (name, benchmark) in enumerate(benchmarks.items()):
+            announce(f"[{number + 1}/{len(benchmarks)}] {name}: {benchmark.title}")
+            measurement = Measurement(
+                name, benchmark.title, sizes.repeats, benchmark.floats, progress, ceilings,
+                load=load_average(),
+            )  # fmt: skip
+            report.measurements.append(measurement)
+            report.interrupted = _interrupted(measurement, benchmark, sizes)
+            results = [f"{fig.what} {fig.value:.4g} {fig.unit}" for fig in measurement.figures]
+            summary = "; ".join(results + measurement.failures) or "nothing"
+            announce(f"      {summary}  ({measurement.seconds:.1f} s)")
+            if report.interrupted:
+                break
+    finally:
+        jax.config.update(cache_folder.ENABLED, cached)
+    return report
+
+
+def _interrupted(measurement: Measurement, benchmark: Benchmark, sizes: Sizes) -> bool:
+    """Runs one benchmark; whether Ctrl-C ended it."""
+    start = time.perf_counter()
+    try:
+        with jax.enable_x64(benchmark.x64):
+            benchmark.measure(measurement, sizes)
+    except KeyboardInterrupt:
+        return True
+    except FAILURES as error:
+        measurement.failures.append(f"failed: {_one_line(error)}")
+    finally:
+        measurement.seconds = time.perf_counter() - start
+    return False
+
+
+def _one_line(error: Exception) -> str:
+    """An error in one line; of a child process, with the last line that it printed."""
+    printed = error.stderr or "" if isinstance(error, subprocess.CalledProcessError) else ""
+    lines = [line for line in f"{error}\n{printed}".splitlines() if line.strip()]
+    first_and_last = lines[:1] + lines[1:][-1:]
+    return f"{type(error).__name__}: {' … '.join(first_and_last)}".rstrip(": ")

@@ -2,19 +2,30 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxtyping import PyTree
+from matplotlib.figure import Figure as PlotFigure
 
-from fitting.report import formatting
-from fitting.report.plots import style
+from fitting.report import formatting, style
+from fitting.report.style import STAGES, styled
 from fitting.runtime import files, xla
 
-from . import scaling_plot
-from .host import hardware, load_average, time_in_width
-from .measurement import Figure, Measurement, medians
-from .runner import Report
+from .measurement import (
+    Figure,
+    Measurement,
+    Report,
+    Series,
+    hardware,
+    load_average,
+    medians,
+    time_in_width,
+)
+
+COLUMNS = 3
+FEW_DECADES = 12  # ratio of the sizes below which every size gets its own tick
 
 
 def to_json(report: Report) -> str:
@@ -172,6 +183,34 @@ def write(report: Report, numbers: Path | None, curves: Path | None) -> list[Pat
     if curves is not None and series:
         machine = hardware()
         title = f"{machine['cpu']}, {machine['threads']} threads"
-        style.save(curves, scaling_plot.curves(series, title))
+        style.save(curves, draw_curves(series, title))
         written.append(curves)
     return written
+
+
+@styled
+def draw_curves(series: Sequence[Series], title: str) -> PlotFigure:
+    """Seconds against each size on logarithmic axes, every curve with its slope.
+
+    Args:
+        series: with at least one point each.
+        title: of the figure.
+    """
+    rows = math.ceil(len(series) / COLUMNS)
+    columns = min(COLUMNS, len(series))
+    figure = PlotFigure(figsize=(6.2 * columns, 4.6 * rows + 0.8), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, one_size in zip(grid, series, strict=False):
+        sizes = one_size.sizes
+        for colour, (name, seconds) in zip(STAGES, one_size.seconds.items(), strict=False):
+            label = f"{name}, slope {one_size.slope(name):.2f}" if len(sizes) > 1 else name
+            axes.loglog(sizes, seconds, "o-", color=colour, markersize=4, label=label)
+        axes.set(xlabel=one_size.size, ylabel="time, s")
+        if max(sizes) < FEW_DECADES * min(sizes):  # too few powers of ten for readable ticks
+            axes.set_xticks(sizes, [str(size) for size in sizes])
+            axes.set_xticks([], minor=True)
+        axes.legend()
+    for axes in grid[len(series) :]:
+        axes.set_axis_off()
+    return figure

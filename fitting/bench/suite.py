@@ -2,38 +2,38 @@
 
 from collections.abc import Mapping
 
-from .benchmarks import ceilings, crowd, first_run, inference, kernels, live, many, scaling
-from .runner import Benchmark
+from . import first_run, fits, kernels, throughput
+from .measurement import Benchmark
 
 CEILINGS = "machine"  # the benchmark of the machine's limits, with which the others are compared
 BENCHMARKS = {
-    CEILINGS: Benchmark("memory, arithmetic and dispatch at their best", "", ceilings.machine),
-    "start": Benchmark("import of jaxik", "", ceilings.start),
+    CEILINGS: Benchmark("memory, arithmetic and dispatch at their best", "", kernels.machine),
+    "start": Benchmark("import of jaxik", "", kernels.start),
     "legs": Benchmark("two-bone legs, corrections out", "float32", kernels.legs),
     "feet": Benchmark("feet: two-bone, ankle, updated transforms", "float32", kernels.feet),
     "step": Benchmark("one frame of one character, dispatch included", "float32", kernels.step),
     "rays": Benchmark("rays against Embree", "float32", kernels.rays),
-    "crowd": Benchmark("the record pipeline for a crowd", "float32", crowd.crowd),
-    "gradient": Benchmark("its gradient, in reverse", "float32", crowd.gradient),
+    "crowd": Benchmark("the record pipeline for a crowd", "float32", throughput.crowd),
+    "gradient": Benchmark("its gradient, in reverse", "float32", throughput.gradient),
     "jacobian": Benchmark(
-        "residuals of twenty parameters and their slopes", "", inference.jacobian, x64=True
+        "residuals of twenty parameters and their slopes", "", fits.jacobian, x64=True
     ),
     "clips": Benchmark(
-        "slopes of one clip and of six", "float64", inference.clips, x64=True, long=True
+        "slopes of one clip and of six", "float64", fits.clips, x64=True, long=True
     ),
     "fit": Benchmark(
-        "a fit of twenty parameters to a clip of 10 s", "float64", inference.fit,
+        "a fit of twenty parameters to a clip of 10 s", "float64", fits.fit,
         x64=True, long=True,
     ),
     "first": Benchmark(
         "seconds that a newcomer waits", "float64", first_run.first_run, long=True
     ),
-    "posterior": Benchmark("the posterior of that fit", "float64", inference.posterior, x64=True),
-    "view": Benchmark("a slider of `jaxik view`", "float64", live.drag, x64=True),
+    "posterior": Benchmark("the posterior of that fit", "float64", fits.posterior, x64=True),
+    "view": Benchmark("a slider of `jaxik view`", "float64", throughput.drag, x64=True),
     "many": Benchmark(
-        "time and memory against devices, clips and workers", "float64", many.many, long=True
+        "time and memory against devices, clips and workers", "float64", throughput.many, long=True
     ),
-    "scaling": Benchmark("time against sizes", "float32", scaling.scaling, long=True),
+    "scaling": Benchmark("time against sizes", "float32", throughput.scaling, long=True),
 }  # fmt: skip
 
 

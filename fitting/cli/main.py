@@ -11,9 +11,9 @@ from pathlib import Path
 from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
-from . import jax_start, start, without_jax
+from . import jax_start, start, terminal, without_jax
 from .parser import make_parser
-from .terminal import unread, watched
+from .terminal import watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, start.INTERRUPTED  # exit statuses
@@ -27,7 +27,7 @@ RENAMED = {"contribution": "ablate"}  # old commands, which still work in this r
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status; a user's mistake prints one line on stderr."""
-    with unread.work_goes_on():
+    with terminal.work_goes_on():
         words = _with_new_command(list(sys.argv[1:] if arguments is None else arguments))
         if null := [word for word in words if "\0" in word]:  # no path, but not every command tries
             print(f"jaxik: a word with a null byte: {null[0]!r}", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 import argparse
 
+from .help_texts import help_formatter
 from .parsers.animations import add_apply, add_compare, add_run, add_view
 from .parsers.files import add_export, add_inspect, add_record, add_terrain
 from .parsers.fits import (
@@ -17,7 +18,6 @@ from .parsers.guides import add_completion, add_doctor, add_example, add_paramet
 from .parsers.machine import add_bench, add_cache
 from .parsers.many import add_fit_many
 from .parsers.options import Parser
-from .terminal.help_texts import help_formatter
 
 EXAMPLES = """examples:
   jaxik init walk.bvh -o walk                                  a first experiment of your clip

@@ -8,10 +8,10 @@ from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
-from fitting.inference.optimisation.solution import Progress
-from fitting.inference.sampling.posterior import SamplingProgress
+from fitting.inference.optimise.solution import Progress
+from fitting.inference.sample.posterior import SamplingProgress
 from fitting.runtime import activity
-from fitting.studies.calibration.calibration import CalibrationProgress
+from fitting.studies.calibrate.calibration import CalibrationProgress
 
 from . import start
 

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from .doctor import examination
+from . import examination
 
 PROBLEMS_FOUND = 1  # exit status
 

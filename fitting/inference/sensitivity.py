@@ -1,6 +1,7 @@
 """Which parameters change a motion at all: a sweep over every range, before anything is fitted."""
 
-from collections.abc import Iterator, Mapping
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxik
-from fitting.problem.free_parameters import free_parameter
-from fitting.problem.prior import SPREAD
+from fitting.problem.problem import rho
 from fitting.problem.residuals import residuals_of_scenes
-from fitting.problem.scene import Scene
-from fitting.problem.space import Space, make_space
+from fitting.problem.scene import Scene, left_alone
+from fitting.problem.space import SPREAD, Space, free_parameter, make_space
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
 
-from .optimisation.population import BATCH
+from .identifiability import UNDETERMINED
+from .optimise.evolution import BATCH
 
 FRACTIONS = (np.arange(6) + 0.5) / 6  # of a range, where each parameter is tried
 DRAWS = 2  # random systems besides the given one: there a parameter may matter that here does not
@@ -26,6 +27,12 @@ NEGLIGIBLE = 0.1  # sigmas; what moves no residual further does not change the m
 UNLIMITED = 4.0  # times its usual range, for an infinite limit: "no limit" must stay in reach
 
 FreeTable = Mapping[str, Mapping[str, float | int | str]]  # names, and overrides of declarations
+
+INDEPENDENT_EVERY = 0.5  # s between residuals of captured motion that tell something new
+
+
+MOST = 4  # parameters that are changed
+AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
 
 
 def all_parameters(ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> dict[str, dict[str, float]]:
@@ -120,3 +127,131 @@ def residuals_at(
 @cached
 def _residuals_of_batch(space: Space, scenes: tuple[Scene, ...], candidates: Array) -> Array:
     return jax.vmap(lambda u: residuals_of_scenes(space.unpack(u), scenes))(candidates)
+
+
+@dataclasses.dataclass(frozen=True)
+class Forecast:
+    """What the clips are expected to say of a parameter."""
+
+    name: str
+    is_free: bool
+    """Whether they should determine it, together with the others that are free."""
+    reach: float
+    """Sigmas by which it can move a residual."""
+    contraction: float
+    """Of its variance, alone: 0 where the clips say nothing, 1 where they decide."""
+    rival: str = ""
+    """The free parameter from which they do not tell it apart; empty where they say little."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it changes the motion at all."""
+        return self.reach > NEGLIGIBLE
+
+
+@in_float64
+def choose_free(
+    ik: jaxik.FootIK, candidates: FreeTable, scenes: tuple[Scene, ...]
+) -> list[Forecast]:
+    """A forecast for each parameter, in the order of the table.
+
+    Args:
+        ik: the system.
+        candidates: the parameters, with overrides of their declarations.
+        scenes: the clips; of these the sigmas count, the references do not. Ranges are those for
+            the body of the first one.
+    """
+    rig, names = scenes[0].rig, list(candidates)
+    parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
+    space = make_space(ik, parameters)
+    seconds = float(np.mean([np.asarray(scene.frames.dt).mean() for scene in scenes]))
+    information, reach = np.zeros((space.size, space.size)), np.zeros(space.size)
+    points = sweep_points(space)
+    for u in points:
+        swept = zip(u, sweep(space, scenes, u), strict=True)
+        each = [
+            (_slope(tried - here, changes), np.abs(changes).max())
+            for here, (tried, changes) in swept
+        ]
+        slopes = np.stack([slope for slope, _ in each])
+        information += min(1.0, seconds / INDEPENDENT_EVERY) * slopes @ slopes.T / len(points)
+        reach = np.maximum(reach, [size for _, size in each])
+    free, rivals = _narrowed_down(information)
+    alone = 1.0 - 1.0 / (1.0 + SPREAD**2 * np.diag(information))
+    return [
+        Forecast(
+            name,
+            is_free=i in free,
+            reach=float(reach[i]),
+            contraction=float(alone[i]),
+            rival=names[rivals[i]] if i in rivals and alone[i] >= UNDETERMINED else "",
+        )
+        for i, name in enumerate(names)
+    ]
+
+
+def _slope(
+    steps: Float[np.ndarray, " tried"], changes: Float[np.ndarray, "tried residuals"]
+) -> Float[np.ndarray, " residuals"]:
+    """Of the line through the origin that is nearest to the changes."""
+    return steps @ changes / (steps @ steps)
+
+
+def _narrowed_down(
+    information: Float[np.ndarray, "all all"],
+) -> tuple[list[int], dict[int, int]]:
+    """Parameters of which enough is known together; of each other, the one most like it then."""
+    free, rivals = list(range(len(information))), {}
+    while free:
+        precision = information[np.ix_(free, free)] + np.eye(len(free)) / SPREAD**2
+        covariance = np.linalg.inv(precision)
+        variances = np.diag(covariance)
+        worst = int(np.argmax(variances))
+        if 1.0 - variances[worst] / SPREAD**2 >= UNDETERMINED:
+            break
+        likeness = np.abs(covariance[worst]) / np.sqrt(variances)
+        likeness[worst] = 0.0
+        rivals[free[worst]] = free[int(np.argmax(likeness))]
+        del free[worst]
+    return free, rivals
+
+
+@in_float64
+def leave_alone(
+    ik: jaxik.FootIK,
+    candidates: FreeTable,
+    scenes: tuple[Scene, ...],
+    is_harmless: Callable[[jaxik.FootIK], bool],
+) -> list[str]:
+    """Names of the parameters that are to be changed; not more than are needed.
+
+    Args:
+        ik: the system.
+        candidates: the parameters, with overrides of their declarations.
+        scenes: the clips, whose animations are to be left as they are.
+        is_harmless: whether a system leaves them alone, which ends the search.
+    """
+    rig = scenes[0].rig
+    parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
+    space = make_space(ik, parameters)
+    scenes = tuple(left_alone(scene) for scene in scenes)
+    u, changed = np.asarray(space.pack({})), list[str]()
+    while len(changed) < MOST and not is_harmless(space.unpack(u)):
+        here = residuals_at(space, scenes, u[None])[0]
+        present, costs, places = _cost(here), [], []
+        for i, (tried, moved) in enumerate(sweep(space, scenes, u)):
+            costs += [_cost(here + row) for row in moved]
+            places += [(i, place) for place in tried]
+        best = min(costs)
+        if not best < present:
+            break
+        good = np.flatnonzero(np.asarray(costs) <= best + AS_GOOD * (present - best))
+        i, place = min((places[k] for k in good), key=lambda at: abs(at[1] - u[at[0]]))
+        u = np.where(np.arange(space.size) == i, place, u)
+        changed.append(space.names[i])
+    return changed
+
+
+def _cost(residuals: Float[np.ndarray, " residuals"]) -> float:
+    """As a fit counts it, without the prior."""
+    return 0.5 * float(np.sum(rho(residuals**2, "huber", library=np)))

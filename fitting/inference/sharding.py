@@ -16,12 +16,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree
 
 import jaxik
-from fitting.inference.noise.marginal import with_unknown_sigmas
-from fitting.problem import stacking
-from fitting.problem.capture.system import CapturedSystem
+from fitting.problem import shared_world
+from fitting.problem.capture_system import CapturedSystem
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scene, residuals_of_scenes
 from fitting.problem.scene import Scene
+
+from .noise import with_unknown_sigmas
 
 Tree = TypeVar("Tree", bound=PyTree)
 
@@ -62,7 +63,7 @@ def over_devices(
     ):
         return problem
     mesh = Mesh(np.array(devices), (CLIPS,))
-    stacks = [_filled(stack, len(devices)) for stack in stacking.stack(problem.data)]
+    stacks = [_filled(stack, len(devices)) for stack in shared_world.stack(problem.data)]
     each = [stack.one(i) for stack in stacks for i in range(len(stack.members))]
     sharded = dataclasses.replace(
         _on_all(dataclasses.replace(problem, data=(), unknown_sigmas=None), mesh),
@@ -86,7 +87,7 @@ def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, 
     parts = []
     for scenes, stacked in zip(data.stacks, data.stacked, strict=True):
         of_clips = jax.vmap(
-            residuals_of_scene, in_axes=(None, stacking.labelled(scenes, stacked, 0))
+            residuals_of_scene, in_axes=(None, shared_world.labelled(scenes, stacked, 0))
         )
         spread = specifications(scenes, stacked, SPLIT)
         # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
@@ -101,7 +102,7 @@ def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, 
     return jnp.concatenate(parts)
 
 
-def _filled(stack: stacking.Stack, devices: int) -> stacking.Stack:
+def _filled(stack: shared_world.Stack, devices: int) -> shared_world.Stack:
     """The stack with clips that nobody observed, until each device has as many."""
     count = len(stack.members)
     whole = -(-count // devices) * devices
@@ -128,7 +129,7 @@ def _on_all(tree: Tree, mesh: Mesh) -> Tree:
     )
 
 
-def _placed(stack: stacking.Stack, mesh: Mesh) -> Scene:
+def _placed(stack: shared_world.Stack, mesh: Mesh) -> Scene:
     """The stack's arrays on their devices."""
     leaves, structure = jax.tree.flatten(stack.scenes)
     placed = [

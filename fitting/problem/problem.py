@@ -1,7 +1,10 @@
 """A space of systems together with the data they are fitted to."""
 
+import dataclasses
+import hashlib
 from collections.abc import Callable
-from typing import Generic
+from types import ModuleType
+from typing import Any, Generic, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -12,8 +15,75 @@ from jaxtyping import Array, Float, PyTree
 from fitting.runtime.precision import in_float64
 from jaxik import lanes
 
-from .loss import TAILS, Loss, apply_loss
 from .space import Space, System, Vector
+
+HUBER = 1.345  # sigmas; 95 % efficient for normal errors (Holland and Welsch 1977)
+CAUCHY = 2.385  # sigmas, likewise
+
+TAILS = 4.0  # degrees of freedom of Student's t, where none are estimated
+
+Loss = Literal["squares", "huber", "cauchy", "student"]
+
+Squares: TypeAlias = Float[Array | np.ndarray, "*residuals"]
+Number: TypeAlias = Float[Array, ""] | float
+
+
+def apply_loss(
+    residuals: Float[Array, " residuals"], loss: Loss, tails: Number = TAILS
+) -> Float[Array, " residuals"]:
+    """Residuals whose squares are `rho(residual²)`; derivatives are finite everywhere.
+
+    The residual is scaled by `sqrt(rho(z) / z)`, since `sign sqrt(rho)` has no derivative at 0.
+    There, the derivative is 1, and Student's `sqrt((nu + 1) / nu)`.
+
+    Args:
+        residuals: in sigmas.
+        loss: its name.
+        tails: Student's degrees of freedom, nu.
+
+    Raises:
+        ValueError: for an unknown loss.
+    """
+    factor, _ = _factor_and_slope(residuals**2, loss, jnp.asarray(tails, residuals.dtype), jnp)
+    return residuals * jnp.sqrt(factor)
+
+
+def rho(z: Squares, loss: Loss, tails: Number = TAILS, library: ModuleType = jnp) -> Squares:
+    """What the loss makes of squared residuals `z`, in sigmas."""
+    return z * _factor_and_slope(z, loss, tails, library)[0]
+
+
+def slope_of_rho(
+    z: Squares, loss: Loss, tails: Number = TAILS, library: ModuleType = jnp
+) -> Squares:
+    """Derivative of `rho` by `z`: how much a residual counts, compared with squares."""
+    return _factor_and_slope(z, loss, tails, library)[1]
+
+
+def _factor_and_slope(
+    z: Any, loss: Loss, tails: Number, library: ModuleType
+) -> tuple[Squares, Squares]:
+    """`rho(z) / z`, finite at 0, and the derivative of `rho`: all that tells losses apart."""
+    match loss:
+        case "squares":
+            return library.ones_like(z), library.ones_like(z)
+        case "huber":
+            slope = HUBER / library.sqrt(library.where(z > HUBER**2, z, HUBER**2))
+            return slope * (2 - slope), slope
+        case "cauchy":
+            return _logarithmic(z / CAUCHY**2, library)
+        case "student":
+            factor, slope = _logarithmic(z / tails, library)
+            return (tails + 1) / tails * factor, (tails + 1) / tails * slope
+        case _:
+            raise ValueError(f"loss is {loss!r}, wanted one of {get_args(Loss)}")
+
+
+def _logarithmic(z: Any, library: ModuleType) -> tuple[Squares, Squares]:
+    """`log(1 + z) / z` and the derivative of `log(1 + z)`."""
+    nonzero = z > library.finfo(z.dtype).eps  # below it the quotient rounds to 1
+    safe = library.where(nonzero, z, 1)
+    return library.where(nonzero, library.log1p(safe) / safe, 1), 1 / (1 + z)
 
 
 class Problem(eqx.Module, Generic[System]):
@@ -117,3 +187,27 @@ class Problem(eqx.Module, Generic[System]):
         known = jnp.sum(squares * (1 - jnp.sum(unknown, axis=0)))
         counts = self.weight * jnp.sum(unknown, axis=1)
         return known + jnp.sum(counts * jnp.log(unknown @ squares))
+
+
+def digest(problem: Problem) -> str:
+    """64 characters that change with any number or name on which the log-probability depends."""
+    problem = eqx.tree_at(lambda problem: problem.space.start, problem, replace=None)
+    digested = hashlib.sha256()
+    function = problem.residual_function
+    names = (function.__module__, function.__qualname__, problem.loss)
+    parameters = [dataclasses.astuple(parameter) for parameter in problem.space.parameters]
+    digested.update(repr((names, parameters)).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(problem, eqx.is_array_like)):
+        name = jax.tree_util.keystr(path)
+        if ".place." in name:  # in a shared world, which changes no number
+            continue
+        array = np.asarray(leaf)
+        digested.update(f"{name} {array.dtype} {array.shape}".encode())
+        digested.update(array.tobytes())
+    return digested.hexdigest()
+
+
+def digest_with(problem: Problem, *settings: object) -> str:
+    """64 characters that also change with anything else that a search follows from."""
+    start = np.asarray(problem.space.start).tolist()
+    return hashlib.sha256(f"{digest(problem)} {(*settings, start)}".encode()).hexdigest()

@@ -10,8 +10,8 @@ import jaxik
 from jaxik.maths import quat, vec
 from jaxik.world.skeleton import Transform
 
-from .capture import observation
-from .capture.system import parted
+from . import capture_system
+from .capture_system import parted
 from .scene import Scene, legs_ws, pelvis_ws
 from .shared_world import groups, run_row, run_scene, scene_in_a_row, split
 
@@ -59,7 +59,7 @@ def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     errors = errors_of_pose(scene, legs_ws(scene, result), pelvis_ws(scene, result))
     contact = result.trace.sensed.contact.weight
     if scene.capture is not None:
-        contact = observation.delayed(scene.capture, scene.frames, contact)
+        contact = capture_system.delayed(scene.capture, scene.frames, contact)
     contact = contact - scene.reference.contact
     ankle, dt = errors["ankle"], scene.frames.dt[1:-1, None, None]
     return errors | {
@@ -78,7 +78,7 @@ def errors_of_pose(scene: Scene, legs: jaxik.LegPose, pelvis: Transform) -> dict
     """
     reference, present = scene.reference, scene.rig.present[..., None]
     if scene.capture is not None:
-        legs, pelvis = observation.shown(scene.capture, scene.rig, scene.frames, legs, pelvis)
+        legs, pelvis = capture_system.shown(scene.capture, scene.rig, scene.frames, legs, pelvis)
     return {
         "ankle": (legs.ankle.pos - reference.ankle.pos) * present,
         "knee": (legs.knee.pos - reference.knee_ws) * present,

@@ -16,8 +16,8 @@ from fitting.runtime.program_cache import cached
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform
 
-from .capture import observation
-from .capture.system import system_and_scenes
+from . import capture_system
+from .capture_system import system_and_scenes
 from .problem import Problem
 from .scene import Scene, legs_ws, own_system, pelvis_ws
 from .shared_world import run_scenes
@@ -125,8 +125,8 @@ def _motion(scene: Scene, result: jaxik.Result) -> Motion:
     legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
     contact = result.trace.sensed.contact.weight
     if (capture := scene.capture) is not None:
-        legs, pelvis = observation.shown(capture, scene.rig, scene.frames, legs, pelvis)
-        contact = observation.delayed(capture, scene.frames, contact)
+        legs, pelvis = capture_system.shown(capture, scene.rig, scene.frames, legs, pelvis)
+        contact = capture_system.delayed(capture, scene.frames, contact)
     return pelvis, legs.knee.pos, legs.ankle, contact
 
 

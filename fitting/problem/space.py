@@ -16,30 +16,40 @@ inside. A uniform prior of a parameter declared above another one is uniform bet
 value and the upper bound, whatever that value is.
 """
 
+import dataclasses
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import Any, Generic, TypeAlias, TypeVar, cast
+from typing import Any, Generic, Literal, TypeAlias, TypeVar, cast, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float
 from scipy import special
 
 from fitting.runtime.precision import in_float64
-from jaxik.maths import parameter_tree
+from jaxik.maths import parameter_tree, smoothing
+from jaxik.world.body import scaled_declarations
+from jaxik.world.skeleton import Rig
 
-from .free_parameters import (
-    FreeParameter,
-    check_inside,
-    from_scale,
-    library_of,
-    present_value,
-    to_scale,
-)
-from .prior import SPREAD, Prior, Priors
+DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (1e-9, 1.0 - 1e-9)}
+NARROWEST, WIDEST = 1e-6, 1e6  # of a range, times the one that the rule declares
+LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
+TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
+OVERRIDES = ("low", "high", "kind", "scale")
+
+
+Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
+Shape = Literal["normal", "uniform"]
+
+SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
+SPREADS = (1e-3, 1e3)  # of u: from almost known to almost all at the bounds
+LOGISTIC_SD = math.pi / math.sqrt(3)  # of the logistic distribution
+
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
 CENTRE_LIMIT = 3.0  # of u, for given centres and for starts: at a bound u is infinite
@@ -51,6 +61,318 @@ DRAWS = 20_000  # from the prior, for the interval of a parameter that depends o
 System = TypeVar("System", bound=eqx.Module)
 Vector: TypeAlias = Float[Array | np.ndarray, " free"]
 Rows = TypeVar("Rows", bound=Float[Array | np.ndarray, "*rows free"])
+
+
+MIXTURE = 200  # draws of the others, where a parameter stays above another free one
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeParameter:
+    """One free parameter: a leaf of the system, or one leg's element of it."""
+
+    name: str
+    """Dotted, with [leg] for one element."""
+    low: float
+    high: float
+    kind: parameter_tree.ParameterKind
+    scale: parameter_tree.Scale
+    above: str | None
+    """Dotted name of the leaf that the value stays above."""
+
+    @property
+    def leaf(self) -> str:
+        """Dotted name without the leg."""
+        return self.name.partition("[")[0]
+
+    @property
+    def leg(self) -> int | None:
+        """Index of the leg whose element is free, or None for the whole leaf."""
+        index = self.name.partition("[")[2]
+        return int(index[:-1]) if index else None
+
+
+def free_parameter(
+    ik: eqx.Module, name: str, rig: Rig | None = None, **overrides: float | int | str
+) -> FreeParameter:
+    """The parameter of this name as its rule declares it, with overrides.
+
+    A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
+    per leg frees a single value that all legs share.
+
+    Args:
+        ik: system, a tree of rules.
+        name: dotted name.
+        rig: whose body the declared range is for; None is the adult.
+        overrides: any of `low`, `high`, `kind`, `scale`.
+
+    Raises:
+        ValueError: for an unknown name or override, a leg that does not exist, or bounds that are
+            out of order or outside the scale's domain.
+    """
+    declared = scaled_declarations(ik, rig)
+    leaf = name.partition("[")[0]
+    if leaf not in declared:
+        nearest = difflib.get_close_matches(leaf, declared, n=1, cutoff=0.0)
+        hint = f"; nearest is {nearest[0]!r}" if nearest else ""
+        raise ValueError(f"no parameter named {leaf!r}{hint}; there are {sorted(declared)}")
+    if unknown := sorted(set(overrides) - set(OVERRIDES)):
+        raise ValueError(f"{name}: unknown {unknown}; a free parameter takes {sorted(OVERRIDES)}")
+    declaration = declared[leaf]
+    kind = overrides.get("kind", declaration.kind)
+    scale = overrides.get("scale", declaration.scale)
+    _check_choice(name, "kind", kind, get_args(parameter_tree.ParameterKind))
+    _check_choice(name, "scale", scale, get_args(parameter_tree.Scale))
+    present_value(ik, name)  # raises for a leg that does not exist
+    parameter = FreeParameter(
+        name=name,
+        low=float(overrides.get("low", declaration.low)),
+        high=float(overrides.get("high", declaration.high)),
+        kind=cast(parameter_tree.ParameterKind, kind),
+        scale=cast(parameter_tree.Scale, scale),
+        above=_absolute(declaration.above, leaf),
+    )
+    _check(parameter, declaration)
+    return parameter
+
+
+def check_inside(parameter: FreeParameter, what: str, value: float) -> None:
+    """Checks that a value is one that the parameter can take.
+
+    Args:
+        parameter: whose bounds count.
+        what: the value is, for the error message.
+        value: in the parameter's unit.
+
+    Raises:
+        ValueError: it is outside the bounds.
+    """
+    if not parameter.low <= value <= parameter.high:
+        raise ValueError(
+            f"{parameter.name}: {what} is {value:g}, wanted from {parameter.low:g} to"
+            f" {parameter.high:g}"
+        )
+
+
+def present_value(ik: eqx.Module, name: str) -> float:
+    """The value that a system has now: of one leg's element, or the mean over a leaf's elements.
+
+    Raises:
+        ValueError: for an element that does not exist.
+    """
+    leaf, bracket, rest = name.partition("[")
+    value = np.asarray(parameter_tree.get(ik, leaf))
+    if not bracket:
+        return float(value.mean())
+    elements = [f"{leaf}[{i}]" for i in range(value.shape[0])] if value.ndim else []
+    if name not in elements:
+        hint = f"there are {elements}" if elements else "it is shared by the legs"
+        raise ValueError(f"no element {name!r}: {hint}")
+    return float(value[int(rest[:-1])])
+
+
+def _absolute(above: str | None, leaf: str) -> str | None:
+    """Dotted name of a field that is declared by its name within the rule of `leaf`."""
+    if above is None or "." not in leaf:
+        return above
+    return f"{leaf.rpartition('.')[0]}.{above}"
+
+
+def _check_choice(name: str, key: str, value: float | str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}: {key} is {value!r}, wanted one of {choices}")
+
+
+def _check(parameter: FreeParameter, declaration: parameter_tree.Declaration) -> None:
+    """Raises ValueError for bounds that make no sense."""
+    low, high = parameter.low, parameter.high
+    bounds = f"{parameter.name}: bounds are {low} to {high}"
+    minimum, maximum = DOMAINS[parameter.scale]
+    if not minimum < low < high < maximum:
+        raise ValueError(
+            f"{bounds}, wanted low < high"
+            f" strictly between {minimum} and {maximum} for the scale {parameter.scale!r}"
+        )
+    usual = declaration.high - declaration.low
+    narrowest, widest = NARROWEST * max(usual, abs(low), abs(high)), WIDEST * usual
+    if not narrowest <= high - low <= widest:
+        raise ValueError(
+            f"{bounds}, {high - low:g} apart, wanted {narrowest:g} to {widest:g};"
+            f" its rule has {declaration.low:g} to {declaration.high:g}"
+        )
+    if parameter.scale == "log" and high / low > LARGEST_RATIO:
+        raise ValueError(
+            f"{bounds}, wanted at most {LARGEST_RATIO:g} times the lower one for the scale 'log'"
+        )
+
+
+def library_of(*arrays: object) -> ModuleType:
+    """JAX if any of these is traced, else NumPy, which takes no time to compile or to call."""
+    return jnp if any(isinstance(array, Tracer) for array in arrays) else np
+
+
+def to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
+    """The coordinate in which a range is divided evenly: `g` of `space`'s docstring."""
+    match scale:
+        case "log":
+            return library.log(value)
+        case "gain":
+            return library.log(-library.log1p(-value))
+        case _:
+            return value
+
+
+def from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
+    """Inverse of `to_scale`."""
+    match scale:
+        case "log":
+            return library.exp(coordinate)
+        case "gain":
+            return -library.expm1(-library.exp(coordinate))
+        case _:
+            return coordinate
+
+
+def scale_width(parameter: FreeParameter) -> float:
+    """Width of a parameter's range on its scale."""
+    return float(
+        np.diff(to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np))[0]
+    )
+
+
+def to_fractions(
+    parameter: FreeParameter, values: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Where values lie in a parameter's range, 0..1, evenly on its scale."""
+    start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return (to_scale(np.asarray(values), parameter.scale, np) - start) / (end - start)
+
+
+def from_fractions(
+    parameter: FreeParameter, fractions: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Inverse of `to_fractions`."""
+    start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
+
+
+def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
+    """The half-life, s, of a gain per tick, and the gains with the same half-life at other rates.
+
+    Args:
+        gain: fraction of the distance to its target that a value moves in each tick.
+        tick_hz: ticks per second.
+    """
+    per_tick, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
+    readings = {"half_life": float(smoothing.half_life_of_gain(per_tick, rate))}
+    for hz in TICK_RATES:
+        fraction = smoothing.fraction_of_gain(per_tick, jnp.asarray(1.0 / hz), rate)
+        readings[f"gain_at_{hz:.0f}_hz"] = float(fraction)
+    return readings
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterPrior:
+    """The prior of one parameter, as an experiment states it.
+
+    Raises:
+        ValueError: for an unknown shape, a spread outside `SPREADS`, or a uniform
+            prior with a centre or a spread.
+    """
+
+    shape: Shape = "normal"
+    centre: float | None = None
+    """Median of a normal prior, in the parameter's unit; None is the system's value."""
+    spread: float | None = None
+    """Standard deviation of a normal prior, in u; None is `SPREAD`."""
+
+    def __post_init__(self) -> None:
+        if self.shape not in get_args(Shape):
+            raise ValueError(f"shape is {self.shape!r}, wanted one of {get_args(Shape)}")
+        for name in ("centre", "spread"):
+            if self.shape == "uniform" and getattr(self, name) is not None:
+                raise ValueError(f"{name} is given, but a uniform prior has none: it is the range")
+        low, high = SPREADS
+        if self.spread is not None and not low <= self.spread <= high:
+            raise ValueError(f"spread is {self.spread}, wanted a number from {low:g} to {high:g}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Priors:
+    """The priors of an experiment's free parameters."""
+
+    default: ParameterPrior = ParameterPrior()
+    """Of all parameters that have none of their own; without a centre."""
+    named: Mapping[str, ParameterPrior] = dataclasses.field(default_factory=dict)
+    """By dotted name."""
+
+    def of(self, name: str) -> ParameterPrior:
+        """The prior of the parameter with this name."""
+        return self.named.get(name, self.default)
+
+
+class Prior(eqx.Module):
+    """The joint prior of `u`; the parameters are independent."""
+
+    centre: Float[Array, " free"]
+    """Of u; 0 where uniform."""
+    spread: Float[Array, " free"]
+    """Of u: a normal's standard deviation, or the scale of a logistic, 1 where uniform."""
+    uniform: Bool[Array, " free"]
+    """Where the prior is not a normal."""
+
+    @property
+    def sd(self) -> Float[Array, " free"]:
+        """Standard deviation of u."""
+        return self.spread * jnp.where(self.uniform, LOGISTIC_SD, 1.0).astype(self.spread.dtype)
+
+    def residuals(self, u: Points) -> Points:
+        """Half of each square is minus the log density, above its minimum.
+
+        For a normal prior that is the distance from its centre in standard deviations.
+        """
+        library = library_of(u, self.centre)
+        centre, spread = library.asarray(self.centre), library.asarray(self.spread)
+        z = (u - centre) / spread
+        return library.where(self.uniform, _logistic_residual(z, library), z)
+
+    def quantile(self, probability: Float[np.ndarray, "*points #free"]) -> np.ndarray:
+        """The `u` below which each parameter lies with this probability, (*points, free)."""
+        normal, logistic = special.ndtri(probability), special.logit(probability)
+        z = np.where(np.asarray(self.uniform), logistic, normal)
+        return np.asarray(self.centre) + np.asarray(self.spread) * z
+
+    def cumulative(self, u: Float[np.ndarray, "*points free"]) -> np.ndarray:
+        """The probability that each parameter lies below its `u`, (*points, free)."""
+        z = (u - np.asarray(self.centre)) / np.asarray(self.spread)
+        return np.where(np.asarray(self.uniform), special.expit(z), special.ndtr(z))
+
+    def widened(self, factor: float) -> "Prior":
+        """The prior with all spreads multiplied; one that was uniform is so no more."""
+        return eqx.tree_at(lambda prior: prior.spread, self, factor * self.spread)
+
+    def draw(self, random: np.random.Generator, count: int) -> Float[np.ndarray, "count free"]:
+        """Independent draws of `u`."""
+        return self.quantile(random.random((count, self.centre.size)))
+
+    def ends(self, rise: float | Float[np.ndarray, " free"]) -> Float[np.ndarray, "2 free"]:
+        """The `u` on either side at which minus the log density exceeds its minimum by `rise`."""
+        normal, logistic = np.sqrt(2 * rise), 2 * np.arccosh(np.exp(0.5 * rise))
+        z = np.where(np.asarray(self.uniform), logistic, normal) * np.array([[-1.0], [1.0]])
+        return np.asarray(self.centre) + np.asarray(self.spread) * z
+
+
+def _logistic_residual(z: Any, library: ModuleType) -> Any:
+    """`2 sign(z) sqrt(log cosh(z / 2))`, without the root of 0 and without overflow."""
+    half = 0.5 * z
+    near = library.abs(half) < 1
+    sinh = library.sinh(library.where(near, half, 0.0))
+    square = sinh**2  # log cosh² = log1p(sinh²)
+    nonzero = square > library.finfo(z.dtype).eps  # below it the factor rounds to 1
+    safe = library.where(nonzero, square, 1.0)
+    at_near = sinh * library.sqrt(2.0 * library.where(nonzero, library.log1p(safe) / safe, 1.0))
+    size = library.where(near, 1.0, library.abs(half))
+    log_cosh = size + library.log1p(library.exp(-2.0 * size)) - math.log(2)
+    return library.where(near, at_near, 2.0 * library.sign(z) * library.sqrt(log_cosh))
 
 
 class Space(eqx.Module, Generic[System]):
@@ -348,3 +670,30 @@ def _order(parameters: Sequence[FreeParameter]) -> tuple[int, ...]:
             raise ValueError(f"these stay above one another: {names}")
         done += ready
     return tuple(done)
+
+
+@in_float64
+def prior_probability(
+    space: Space, values: Float[np.ndarray, "points free"]
+) -> Float[np.ndarray, "points free"]:
+    """The probability, by the prior alone, that each parameter is at most each of these values.
+
+    Exact, except for a parameter that stays above another free one: the mean over draws of that
+    one. Values outside the bounds have probability 0 or 1.
+    """
+    probability = _probability(space, values)
+    for i in space.dependent:
+        draws = space.prior.draw(np.random.default_rng(0), MIXTURE)
+        rows = np.asarray(space.values(draws))
+        table = np.repeat(rows[:, None], len(values), axis=1)
+        table[..., i] = values[:, i]
+        mixed = _probability(space, table.reshape(-1, space.size))[:, i]
+        probability[:, i] = mixed.reshape(MIXTURE, -1).mean(axis=0)
+    return probability
+
+
+def _probability(space: Space, rows: np.ndarray) -> np.ndarray:
+    """Of the last moved parameter given the others of its row, (rows, free)."""
+    u = space.pack_values(rows)
+    below, above = rows <= np.asarray(space.low), rows >= np.asarray(space.high)
+    return np.where(below, 0.0, np.where(above, 1.0, space.prior.cumulative(u)))

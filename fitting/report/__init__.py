@@ -1,10 +1,9 @@
-"""What people read after a job: summaries in Markdown, tables for the terminal, pictures.
+"""What all reports share: words, tables, pages, colours.
 
-Nothing here computes: reports word and draw what `fitting.studies` and `fitting.analysis` return.
+`formatting` sets numbers, and tables as text that knows its cells, and names every number and its
+unit. `pages` fills the template of a page, of sections of text, tables and pictures; `motion_data`
+puts clips into it. `style` is how plots look, `guides` are the lists of parameters and keys.
 
-Start with `fit_report`, which writes the summary of a fit; the other modules named `*_report` do
-the same for the other jobs, or for a section of a summary. `uncertainty/` has tables of what is
-known of the parameters, `calibration/` the report of a calibration. `labels` names every number
-and its unit, `formatting` sets numbers, and tables as text that knows its cells, and `plots/`
-draws.
+Each study words and draws its own results, in its own folder of `fitting.studies`. Start with
+`formatting`.
 """

@@ -1,10 +1,11 @@
 """How programs run on this machine: nothing here knows about feet, clips or experiments.
 
 `xla` sets compiler flags, `precision` enables 64 bits, `threads` spreads calls over the cores,
-`activity` announces what takes long, `files` writes whole files or none, `storage` is about folders
-and files that other processes may have damaged, left or claimed, `validation` checks what users
-write in TOML. `program_cache` keeps
-traced programs between processes: `cache_folder` says where, `program_key` which one,
-`program_file` how, and `plain_tree` writes down what a program's input and output are besides
-arrays. It holds no settings of the fit. Start with `files`, which everything that writes uses.
+`cluster` over machines, `activity` announces what takes long, `files` writes whole files or none,
+`json_files` and `claimed_folder` are about files and folders that other processes may have damaged,
+left or claimed, and `validation` checks what users write in TOML. `program_cache` keeps traced
+programs between processes, `cache_folder` says where, and `plain_tree` writes down what a program's
+input and output are besides arrays. It holds no settings of the fit.
+
+Start with `files`, which everything that writes uses.
 """

@@ -3,6 +3,7 @@
 It is JAX's folder for compiled programs. The traced ones lie in a folder inside it.
 """
 
+import functools
 import os
 import re
 import sys
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 
-from .storage import compiled_programs
+from . import files
 from .validation import in_one_line
 
 FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  # settings of JAX
@@ -23,6 +24,8 @@ TRACED = "traced"  # inside JAX's folder
 TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*(\.jaxik-\w+-\d+-\w+)?")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)(\.jaxik-\w+-\d+-\w+)?")
 WARNED: set[str] = set()  # problems that this process has warned of
+
+SUFFIX = "-cache"  # of the files' names
 
 
 class SwitchedOffError(Exception):
@@ -43,7 +46,7 @@ def use_default() -> None:
     JAX would run what it finds there. In any folder, JAX then writes its files completely or not
     at all (`compiled_programs`).
     """
-    compiled_programs.write_complete_files()
+    write_complete_files()
     if setting(FOLDER) is not None:
         return
     try:
@@ -135,3 +138,35 @@ def _files(folder: Path, names: re.Pattern[str]) -> Iterator[Path]:
         if names.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
             if _is_own(entry.stat(follow_symlinks=False)):
                 yield Path(entry)
+
+
+@functools.cache
+def write_complete_files() -> None:
+    """Has JAX write complete files, also in place of damaged ones.
+
+    It writes as before where it locks the folder, to bound its size, and to storage that is not a
+    folder of this machine. JAX has no setting for this; a version without the class that is
+    changed here writes as it likes.
+    """
+    try:
+        from jax._src.lru_cache import LRUCache
+    except ImportError:
+        return
+    in_place = LRUCache.put
+
+    def put(self: LRUCache, key: str, value: bytes) -> None:
+        """Keeps a compiled program, which JAX offers only if it could not read it."""
+        if self.eviction_enabled or "://" in str(self.path):
+            in_place(self, key, value)
+        else:
+            path = Path(self.path, f"{key}{SUFFIX}")
+            _sweep_once(path.parent)
+            files.write(path, lambda temporary: temporary.write_bytes(value), lasting=False)
+
+    LRUCache.put = put
+
+
+@functools.cache
+def _sweep_once(folder: Path) -> None:
+    """Removes what killed processes have left; a folder of thousands of files takes long."""
+    files.sweep(folder)

@@ -15,6 +15,7 @@ import stat
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +27,10 @@ TEMPORARY = re.compile(rf"\..*\.jaxik-{re.escape(HOST)}-(\d+)-\w+(\.\w+)?")
 
 OWNERS_ONLY = stat.S_IFREG | 0o600  # mode of files that are being written
 NO_LONGER_WRITTEN = 3600.0  # s since the last change, after which a file of 0.1.0 is a dead one's
+
+
+SEAL = b"jaxik crc32 "
+DIGITS = 8
 
 
 def check_output_file(path: Path) -> None:
@@ -144,3 +149,33 @@ def _synchronise(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def write_sealed(path: Path, image: bytes | memoryview) -> None:
+    """Writes a file and its seal.
+
+    Raises:
+        ValueError: it cannot be written.
+    """
+    seal = SEAL + f"{zlib.crc32(image):0{DIGITS}x}".encode()
+
+    def fill(temporary: Path) -> None:
+        with open(temporary, "wb") as stream:
+            stream.write(image)
+            stream.write(seal)
+
+    write(path, fill)
+
+
+def check_seal(path: Path) -> None:
+    """Checks that a file's bytes are those that were written, if it has a seal.
+
+    Raises:
+        ValueError: they are not.
+        OSError: it cannot be read.
+    """
+    content = path.read_bytes()
+    length = len(SEAL) + DIGITS
+    image, seal = memoryview(content)[:-length], content[-length:]
+    if seal.startswith(SEAL) and seal[len(SEAL) :] != f"{zlib.crc32(image):0{DIGITS}x}".encode():
+        raise ValueError("its bytes are not those that were written")

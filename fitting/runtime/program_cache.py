@@ -5,12 +5,20 @@ a fit, tracing takes longer than the search. Here the text itself is kept, in a 
 is named after its `program_key`.
 """
 
+import dataclasses
 import functools
+import hashlib
+import importlib
 import itertools
+import json
+import os
+import re
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,12 +29,16 @@ from jaxtyping import PyTree
 
 import jaxik
 
-from . import activity, cache_folder, program_file
-from .cache_folder import warn_once
+from . import activity, cache_folder, files, plain_tree
+from .cache_folder import setting, warn_once
 from .plain_tree import NotPlainError
-from .program_file import Program, Slot
-from .program_key import Arguments, array_type, program_key, versions
 from .validation import in_one_line
+
+MAGIC = b"jaxik program 1\n"
+# How JAX names calls from a program back into Python; no program of this project has one.
+CALLBACK = re.compile(rb"python_\w*callback")
+
+Arguments: TypeAlias = tuple[tuple[object, ...], Mapping[str, object]]
 
 # JAX refuses to export these calls because their names may change with jaxlib, whose version is
 # part of the key here. They belong to the least-squares solves of a fit.
@@ -39,6 +51,136 @@ TRACING = threading.RLock()  # parallel tracing gains nothing, and shared parts 
 Inputs = ParamSpec("Inputs")
 Output = TypeVar("Output")
 Tree = TypeVar("Tree")
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """The place of an array in an output."""
+
+    index: int
+
+
+class Program(NamedTuple):
+    """A traced program."""
+
+    exported: export.Exported
+    output: PyTree
+    """Its output, with a `Slot` in place of each array."""
+
+    def call(self, arrays: list[jax.Array]) -> PyTree:
+        """The output for these arrays."""
+        outputs = self.exported.call(*arrays)
+        return jax.tree.map(
+            lambda leaf: outputs[leaf.index] if isinstance(leaf, Slot) else leaf, self.output
+        )
+
+
+def write(path: Path, program: Program, key: str, versions: Mapping[str, str]) -> None:
+    """Writes a program.
+
+    Raises:
+        NotPlainError: its output holds more than arrays, plain values and dataclasses.
+        OSError: the disk is full, or the like.
+        ValueError: the folder may not be written to.
+    """
+    body = bytes(program.exported.serialize())
+    header = {
+        "key": key,
+        "versions": versions,
+        "output": plain_tree.describe(program.output),
+        "sha256": hashlib.sha256(body).hexdigest(),
+    }
+    content = MAGIC + json.dumps(header).encode() + b"\n" + body
+    files.write(path, lambda temporary: temporary.write_bytes(content))
+
+
+def read(path: Path, key: str, versions: Mapping[str, str]) -> Program | None:
+    """The program in a file; None if there is no file.
+
+    Raises:
+        OSError: the file cannot be read, or is somebody else's.
+        ValueError: it is damaged, or another program than expected.
+    """
+    try:
+        with path.open("rb") as file:
+            cache_folder.check_own(path, os.fstat(file.fileno()))
+            content = file.read()
+    except FileNotFoundError:
+        return None
+    try:
+        return _decode(content, key, versions)
+    except Exception as error:  # the many errors with which parsers meet damage
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _decode(content: bytes, key: str, versions: Mapping[str, str]) -> Program:
+    if not content.startswith(MAGIC):
+        raise ValueError(f"it begins with {content[: len(MAGIC)]!r}; wanted {MAGIC!r}")
+    line, _, body = content[len(MAGIC) :].partition(b"\n")
+    header = json.loads(line)
+    expected = {"key": key, "versions": versions, "sha256": hashlib.sha256(body).hexdigest()}
+    for name, value in expected.items():
+        if header[name] != value:
+            raise ValueError(f"its {name} is {header[name]!r}; wanted {value!r}")
+    if CALLBACK.search(body):
+        raise ValueError("the program calls Python")
+    return Program(export.deserialize(bytearray(body)), plain_tree.rebuild(header["output"]))
+
+
+class ArrayType(NamedTuple):
+    """What a program depends on of an array."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    weak_type: bool
+
+
+def array_type(array: jax.Array) -> ArrayType:
+    """The type of an array, which may be traced."""
+    aval = jax.typeof(array)
+    return ArrayType(aval.shape, str(aval.dtype), aval.weak_type)
+
+
+def program_key(function: Callable, arguments: Arguments) -> str:
+    """A digest of everything that a function's program is traced from.
+
+    That is the function, the static part of its arguments, the types of their arrays, JAX's
+    settings, the source of this project and the versions of the libraries.
+
+    Raises:
+        NotPlainError: the function or an argument comes from elsewhere, where source may change
+            unnoticed, or an argument is no plain value.
+    """
+    module, name = function.__module__, function.__qualname__
+    if module.partition(".")[0] not in plain_tree.PROJECT or "<" in name:  # <locals>, <lambda>
+        raise plain_tree.NotPlainError(f"{module}.{name} is no named function of this project")
+    types = jax.tree.map(lambda leaf: array_type(leaf) if eqx.is_array(leaf) else leaf, arguments)
+    settings = [setting("jax_enable_x64"), str(setting("jax_default_matmul_precision"))]
+    parts = [
+        [module, name],
+        plain_tree.describe(types),
+        [jax.default_backend(), *settings],
+        versions(),
+        sources(),
+    ]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+@functools.cache
+def versions() -> Mapping[str, str]:
+    """The versions of Python and of the libraries, by name."""
+    return {"python": sys.version} | {name: metadata.version(name) for name in plain_tree.LIBRARIES}
+
+
+@functools.cache
+def sources() -> str:
+    """A digest of this project's source."""
+    digest = hashlib.sha256()
+    for package in plain_tree.PROJECT:
+        root = Path(str(importlib.import_module(package).__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 class _Place(NamedTuple):
@@ -131,7 +273,7 @@ def _place(function: Callable, arguments: Arguments) -> _Place | None:
 
 def _read(place: _Place) -> Program | None:
     try:
-        return program_file.read(place.path, place.key, versions())
+        return read(place.path, place.key, versions())
     except (OSError, ValueError) as error:
         warn_once("a kept program is traced anew", in_one_line(error))
         return None
@@ -139,7 +281,7 @@ def _read(place: _Place) -> Program | None:
 
 def _write(place: _Place, program: Program) -> None:
     try:
-        program_file.write(place.path, program, place.key, versions())
+        write(place.path, program, place.key, versions())
     except (OSError, ValueError, NotPlainError) as error:
         warn_once("traced programs are not kept", in_one_line(error))
 

@@ -1,6 +1,12 @@
-"""The studies: what is computed for a fit, a posterior, a comparison, an ablation, a translation.
+"""The studies, each with its computing, its report and its job: deleting its place deletes it.
 
-A study takes an experiment or systems, and returns numbers; `run_folder` keeps those of a fit on
-disk. It writes no reports and prints nothing: that is for `report`, and `jobs` runs a study from
-its files to its report. Start with `fit`.
+A fit (`fit`), its posterior (`sample`), a first experiment (`drafts`), ablations (`ablation`),
+calibrations (`calibrate`), clips of several subjects (`population`), many fits at once (`many`), a
+finished system on clips (`animations`), several systems on one clip (`compare`) or in made
+situations (`suite`), translations between systems (`translation`), and reconstructed ground
+(`terrain_report`). `output` is what the folders of all have in common, `notebook` what notebooks
+show, `exports` what other programs read.
+
+A job takes what the user gave, from files to a folder with results; `fitting.jobs` lists them.
+Start with `fit.fit`.
 """

@@ -7,37 +7,77 @@ strides over the cuts, and all fits of a variant share their compiled programs. 
 written at once to `contribution.json`, from which an interrupted call continues.
 """
 
+import csv
 import hashlib
+import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 import jaxik
-from fitting.analysis.accuracy import Accuracy, Errors, clip_errors, summarise
-from fitting.datasets.clips import Clip, edit
-from fitting.datasets.ground_path import place_root
-from fitting.experiments.ablations import COMPLETE, Ablation
-from fitting.experiments.experiment import ClipEntry, Experiment
-from fitting.experiments.experiment_files import experiment_to_toml
-from fitting.experiments.problems import ClipData, load_clip_data, problem_from_clips
-from fitting.experiments.systems import leaf_names
-from fitting.inference.optimisation.solution import Progress
-from fitting.inference.sampling.settings import SamplerSettings
-from fitting.runtime import activity
-from fitting.runtime.storage.declared_types import Finite, checked
-from fitting.runtime.storage.json_files import JsonFile
+from fitting.clips import Clip, edit
+from fitting.experiment import file_tables
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiment.file_tables import COMPLETE, Ablation
+from fitting.experiment.in_memory import with_files
+from fitting.experiment.problems import ClipData, load_clip_data, problem_from_clips
+from fitting.experiment.systems import leaf_names
+from fitting.ground.ground_path import place_root
+from fitting.inference.optimise.solution import Progress
+from fitting.inference.sample.blocks import SamplerSettings
+from fitting.motion.accuracy import Accuracy, Errors, clip_errors, summarise
+from fitting.report import pages, style
+from fitting.report.formatting import (
+    ACCURACY,
+    Table,
+    aligned,
+    bullets,
+    explanations,
+    headings,
+    joined,
+    markdown,
+    meanings,
+    number,
+    transposed,
+)
+from fitting.report.pages import Block, Finding, Grid, Points, Section, StudyPage, Terms, Text
+from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
+from fitting.runtime import activity, files
+from fitting.runtime.json_files import Finite, JsonFile, checked
+from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
-from .animations import Animation
-from .assess import search_with_noise
+from .animations.animations import Animation
+from .fit.assess import search_with_noise
+from .fit.sentences import listed
+from .output import Log, log_output, output_folder, silent
 
 NUMBERS = "contribution.json"
+
+TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
+SHOWN = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "pop")
+
+MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
+FILES = {
+    TABLE: "the tables",
+    CELLS: "all figures",
+    NUMBERS: "all fits",
+    FIGURE: "the figure",
+}
+
+PANELS_PER_ROW = 4
+ABLATED = STAGES[1]
 
 
 @dataclass(frozen=True)
@@ -87,7 +127,7 @@ class Split:
     """Clips, and the frames of them that count."""
 
 
-def ablate(
+def fit_variants(
     experiment: Experiment,
     folder: Path | None = None,
     *,
@@ -335,3 +375,363 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
         row["agreement"] = {k: None if math.isnan(v) else v for k, v in row["agreement"].items()}
     folder.mkdir(parents=True, exist_ok=True)
     ROWS_FILE.write(folder / NUMBERS, {"rows": content})
+
+
+def write(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
+    """Writes table.md, table.csv and contribution.png into an existing folder."""
+    title = f"{experiment.name}: without each of its rules"
+    style.save(folder / FIGURE, overview(rows, title))
+    files.write_text(folder / CELLS, cells(rows))
+    files.write_text(folder / TABLE, _summary(experiment, rows))
+
+
+def row_text(row: Row) -> str:
+    """A finished row in one line, for the terminal."""
+    figures = ", ".join(
+        f"{ACCURACY[key].heading} {ACCURACY[key].format(getattr(row.agreement, key))}"
+        for key in SHOWN
+    )
+    return f"{row_name(row)}: {figures}; {row.seconds:.0f} s"
+
+
+def tables_text(rows: Sequence[Row]) -> str:
+    """All groups of rows, for the terminal."""
+    groups = [
+        joined(["", f"{title}:", "", aligned(group(rows, part))])
+        for part, title in titles(rows).items()
+    ]
+    return joined(groups)
+
+
+def titles(rows: Sequence[Row]) -> dict[int, str]:
+    """The title of each group of rows, by the part that was held out."""
+    parts = sorted({row.part for row in rows} - {0})
+    held_out = {
+        part: f"Part {part} of {len(parts)} held out: fitted on all else, measured on it"
+        for part in parts
+    }
+    return held_out | {0: "Everything fitted, everything measured"}
+
+
+def group(rows: Sequence[Row], part: int) -> Table:
+    """A row for each variant; in brackets, how much each figure rises without the rule."""
+    members = [row for row in rows if row.part == part]
+    complete = members[0].agreement
+    table = [["", *headings(ACCURACY)]]
+    for row in members:
+        figures = []
+        for key, column in ACCURACY.items():
+            value, before = getattr(row.agreement, key), getattr(complete, key)
+            figures.append(column.format(value) + _rise(key, value - before))
+        table.append([variant_name(row.variant), *figures])
+    return table
+
+
+def cells(rows: Sequence[Row]) -> str:
+    """All figures as CSV, in the units of their columns."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [f"{key} [{column.unit}]" for key, column in ACCURACY.items()]
+    writer.writerow(["variant", "held out", *columns, "fitted", "converged", "seconds"])
+    for row in rows:
+        figures = [
+            f"{column.factor * value:.6g}"
+            for column, value in zip(ACCURACY.values(), astuple(row.agreement), strict=True)
+        ]
+        fit = [len(row.values), row.converged, f"{row.seconds:.1f}"]
+        writer.writerow([row.variant, row.part or "nothing", *figures, *fit])
+    return text.getvalue()
+
+
+def _summary(experiment: Experiment, rows: Sequence[Row]) -> str:
+    parts = [
+        f"# {experiment.name}: without each of its rules",
+        "Each row is a fit of its own. In brackets: how much a figure rises without the rule. "
+        "Measured at the rate of the clips.",
+    ]
+    for part, title in titles(rows).items():
+        parts += [f"## {title}", markdown(group(rows, part))]
+    parts += [f"![All figures]({FIGURE})", "## What is left out", bullets(changes(experiment))]
+    parts += ["## Fitted values, on everything", markdown(values(rows))]
+    if unconverged := [row for row in rows if not row.converged]:
+        parts.append("Fits that did not converge:")
+        parts.append(bullets([f"{row_name(row)}: {row.message}" for row in unconverged]))
+    parts += ["## What the columns mean", explanations(ACCURACY)]
+    return "\n\n".join(parts) + "\n"
+
+
+def changes(experiment: Experiment) -> list[str]:
+    """What each variant changes, a line each."""
+    lines = []
+    for ablation in experiment.without:
+        changes = [f"`{stage}` is `{name}`" for stage, name in ablation.rules.items()]
+        changes += [f"`{name}` = {value}" for name, value in ablation.parameters.items()]
+        lines.append(f"**{ablation.name}**: {', '.join(changes)}")
+    return lines or ["Nothing."]
+
+
+def values(rows: Sequence[Row]) -> Table:
+    """A row for each parameter, a column for each variant; a dash where it is not free."""
+    everything = [row for row in rows if not row.part]
+    names = list(dict.fromkeys(name for row in everything for name in row.values))
+    table = [["parameter", *(variant_name(row.variant) for row in everything)]]
+    for name in names:
+        fitted = [row.values.get(name) for row in everything]
+        table.append([f"`{name}`", *("–" if v is None else number(v) for v in fitted)])
+    return table
+
+
+def row_name(row: Row) -> str:
+    """A variant, and what was held out."""
+    split = f"part {row.part} held out" if row.part else "everything"
+    return f"{variant_name(row.variant)}, {split}"
+
+
+def _rise(key: str, rise: float) -> str:
+    """A rise in brackets; nothing where it is unknown or rounds to 0."""
+    column = ACCURACY[key]
+    text = f"{column.factor * rise:+.{column.digits}f}"
+    return "" if np.isnan(rise) or float(text) == 0.0 else f" ({text})"
+
+
+class Rise(NamedTuple):
+    """How much further ankles are from the captured ones without a rule, on parts held out."""
+
+    variant: str
+    mean: float
+    """Metres."""
+    everywhere: bool
+    """Whether they are further in every part."""
+
+
+def write_page(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
+    """Writes the page into the folder of an ablation, whose figure is there."""
+    unconverged = [row for row in rows if not row.converged]
+    StudyPage(
+        kind="An experiment without each of its rules",
+        title=experiment.name,
+        verdict=f"{len(unconverged)} fits not converged" if unconverged else "All fits converged",
+        good=not unconverged,
+        findings=findings(rows),
+        sections=[
+            _figures(folder, experiment, rows),
+            Section("What is left out", [Points(changes(experiment))]),
+            Section(
+                "Fitted values, on everything",
+                [Grid(values(rows), "Fitted values of all variants")],
+            ),
+            _limits(rows, unconverged),
+        ],
+        asked=[*pages.rows(experiment), ["Parts of each clip", f"{_parts(rows)}"]],
+        files=FILES,
+    ).write(folder)
+
+
+def rises(rows: Sequence[Row]) -> list[Rise]:
+    """Of each variant, the largest first; without those of which nothing is known."""
+    held_out = {(row.variant, row.part): row.agreement.ankle for row in rows if row.part}
+    parts = sorted({part for _, part in held_out})
+    findings = []
+    for variant in dict.fromkeys(row.variant for row in rows if row.variant != COMPLETE):
+        each = [held_out[variant, part] - held_out[COMPLETE, part] for part in parts]
+        mean = sum(each) / len(each)
+        if not math.isnan(mean):
+            findings.append(Rise(variant, mean, all(rise > 0.0 for rise in each)))
+    return sorted(findings, key=lambda rise: -rise.mean)
+
+
+def findings(rows: Sequence[Row]) -> list[Finding]:
+    """Whether all fits converged and hold elsewhere, which rules matter, which could go."""
+    return [_soundness(rows), *_rules(rises(rows))]
+
+
+def _parts(rows: Sequence[Row]) -> int:
+    return max(row.part for row in rows)
+
+
+def _soundness(rows: Sequence[Row]) -> Finding:
+    complete = [row for row in rows if row.variant == COMPLETE]
+    held_out = [row.agreement.ankle for row in complete if row.part]
+    seen = next(row.agreement.ankle for row in complete if not row.part)
+    distance = (
+        f"with all rules the ankles are {100 * sum(held_out) / len(held_out):.2f} cm from the "
+        f"captured ones (rms) on parts that were held out, {100 * seen:.2f} cm where everything "
+        "was fitted"
+    )
+    count = sum(not row.converged for row in rows)
+    if count:
+        return Finding(
+            f"{count} of {len(rows)} fits did not converge, so that differences between them may "
+            f"be those of the search; {distance}.",
+            bad=True,
+        )
+    return Finding(f"All {len(rows)} fits converged; {distance}.")
+
+
+def _rules(rises: Sequence[Rise]) -> list[Finding]:
+    if not rises:
+        nothing = "No variant could be measured, so nothing is known of single rules."
+        return [Finding(nothing, bad=True)]
+    first = rises[0]
+    size = f"{100 * first.mean:.2f} cm"
+    if first.mean <= MARGIN:
+        most = Finding(
+            "No rule is needed: without any one of them, ankles of held-out parts are no further "
+            "from the captured ones.",
+            bad=True,
+        )
+    else:
+        where = "in every part" if first.everywhere else "on average, though not in every part"
+        most = Finding(
+            f"Without `{first.variant}` the ankles of held-out parts are {size} further off, the "
+            f"most of all, {where}."
+        )
+    idle = [f"`{rise.variant}`" for rise in rises if rise.mean <= MARGIN]
+    if idle:
+        return [
+            most,
+            Finding(
+                f"{listed(idle)} {'earns' if len(idle) == 1 else 'earn'} nothing here: without "
+                f"{'it' if len(idle) == 1 else 'any of them'} held-out ankles are as close, or "
+                f"closer by up to {max(0.0, -100 * rises[-1].mean):.2f} cm.",
+                bad=True,
+            ),
+        ]
+    if len(rises) == 1:
+        return [most, Finding("Nothing else is left out, so nothing is known of other rules.")]
+    last = rises[-1]
+    return [
+        most,
+        Finding(
+            f"Each of the {len(rises)} variants is worse than the whole; least is missed "
+            f"`{last.variant}`, with {100 * last.mean:.2f} cm."
+        ),
+    ]
+
+
+def _figures(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> Section:
+    blocks: list[Block] = [
+        Text(
+            "Each column is a fit. In brackets: how much a figure rises without the rule. "
+            "Measured at the rate of the clips."
+        )
+    ]
+    for part, title in titles(rows).items():
+        blocks.append(Grid(transposed(group(rows, part)), title, title))
+    captions = {FIGURE: f"{experiment.name}: all figures without each of its rules"}
+    blocks += pages.embed(folder, captions)
+    return Section("With and without each rule", [*blocks, Terms(meanings(ACCURACY))])
+
+
+def _limits(rows: Sequence[Row], unconverged: Sequence[Row]) -> Section:
+    lines = [
+        f"Clips are cut into {_parts(rows)} parts; differences that are not the same in all of "
+        "them may be chance.",
+        "Parts of one clip show the same person on the same ground: on others a rule may be worth "
+        "more or less.",
+        *(f"Not converged: {row_name(row)}: {row.message}" for row in unconverged),
+    ]
+    return Section("Limits of the data", [Points(lines)])
+
+
+def variant_name(variant: str) -> str:
+    """A variant as tables and axes call it."""
+    return variant if variant == COMPLETE else f"without {variant}"
+
+
+@styled
+def overview(rows: Sequence[Row], title: str) -> Figure:
+    """Each figure of all variants: on parts held out, and where everything was fitted."""
+    variants = list(dict.fromkeys(row.variant for row in rows))
+    lines = -(-len(ACCURACY) // PANELS_PER_ROW)
+    size = (17, lines * (0.45 * len(variants) + 1.2) + 1.8)
+    figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(lines, PANELS_PER_ROW, squeeze=False, sharey=True)
+    for axes, key in zip(grid.flat, ACCURACY, strict=False):
+        _bars(axes, key, rows, variants)
+    for axes in list(grid.flat)[len(ACCURACY) :]:
+        axes.set_axis_off()
+    legend(
+        figure,
+        Patch(color=AFTER, label=f"{COMPLETE}: mean of the parts held out"),
+        Patch(color=ABLATED, label="without this rule: mean of the parts held out"),
+        Line2D([], [], marker="o", linestyle="", color="black", label="each part held out"),
+        Line2D([], [], marker="D", linestyle="", color=CAPTURED, label="fitted on everything"),
+    )
+    return figure
+
+
+def _bars(axes: Axes, key: str, rows: Sequence[Row], variants: Sequence[str]) -> None:
+    """One figure of all variants."""
+    column, largest = ACCURACY[key], 0.0
+    for place, variant in enumerate(variants):
+        own = [row for row in rows if row.variant == variant]
+        held_out = [getattr(row.agreement, key) for row in own if row.part]
+        everything = [getattr(row.agreement, key) for row in own if not row.part]
+        mean = float(np.mean(held_out))
+        values = column.factor * np.array([*held_out, *everything])
+        end = float(np.nan_to_num(values).max())
+        largest = max(largest, end)
+        colour = AFTER if variant == COMPLETE else ABLATED
+        axes.barh(place, column.factor * np.nan_to_num(mean), color=colour, height=0.7)
+        parts = len(held_out)
+        axes.plot(values[:parts], [place] * parts, "o", color="black", markersize=5)
+        axes.plot(values[parts:], [place], "D", color=CAPTURED, markersize=6)
+        axes.annotate(
+            column.format(mean), (end, place), xytext=(8, 0),
+            textcoords="offset points", va="center",
+        )  # fmt: skip
+        if variant == COMPLETE and not np.isnan(mean):
+            axes.axvline(column.factor * mean, color=AFTER, linestyle="--", linewidth=1.2)
+    axes.locator_params(axis="x", nbins=4)
+    axes.set_xlim(0.0, 1.3 * max(largest, 10.0 ** (1 - column.digits)))
+    axes.set_ylim(len(variants) - 0.4, -0.6)
+    axes.set_yticks(range(len(variants)), [variant_name(variant) for variant in variants])
+    axes.tick_params(axis="y", length=0)
+    axes.grid(False, axis="y")
+    axes.set_title(f"{column.heading.capitalize()}, {column.unit}")
+
+
+@in_float64
+def ablate(
+    experiment: Experiment | str | Path,
+    output: str | Path | None = None,
+    *,
+    folds: int = 2,
+    progress: Callable[[Progress], None] | None = None,
+    log: Log = silent,
+) -> list[Row]:
+    """Fits an experiment as it is and without each of its rules, cross-validated.
+
+    What is left out stands in the experiment's [[without]] tables. Each finished fit is written at
+    once, and a call with the same folder continues where an interrupted one ended.
+
+    Args:
+        experiment: an experiment, or the path of its file.
+        output: folder for the fits and the report.
+        folds: number of parts into which each clip is cut.
+        progress: called as a fit goes on; its stage names the variant and the part.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: as `fit_variants`, the experiment fits a capture, too, or the folder
+            cannot be made.
+    """
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(experiment)
+    file_tables.refuse(experiment.capture, str(experiment.path), "ablate")
+    with output_folder(output) as folder:
+        experiment = replace(with_files(experiment, folder), holdout=0.0)
+
+        def log_row(row: Row) -> None:
+            log(row_text(row))
+
+        rows = fit_variants(experiment, folder, folds=folds, progress=progress, on_row=log_row)
+        if folder is not None:
+            with activity.announced("Drawing the report"):
+                write(folder, experiment, rows)
+                write_page(folder, experiment, rows)
+        log(tables_text(rows))
+        log_output(log, folder, TABLE)
+        return rows

@@ -11,34 +11,54 @@ translation.json        the remaining differences, as numbers
 difference.png          the remaining differences over time
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Array
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 import jaxik
-from fitting.analysis import difference
-from fitting.datasets import clip_frames, clips
-from fitting.datasets.clips import edit
-from fitting.datasets.ground_path import place_root
-from fitting.experiments import parameter_files, systems
-from fitting.experiments.experiment import ClipEntry, Experiment
-from fitting.experiments.problems import ClipData, problem_from_clips
+from fitting import clips
+from fitting.clips import clip_frames, edit
+from fitting.experiment import parameter_files, systems
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.problems import ClipData, problem_from_clips
+from fitting.ground.ground_path import place_root
 from fitting.inference import sensitivity
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.optimisation.population import evaluate
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.state import Search, SearchState
-from fitting.inference.optimisation.sweep import sweep
+from fitting.inference.noise import NoiseOptions
+from fitting.inference.optimise.evolution import evaluate, sweep
+from fitting.inference.optimise.solution import Search, SearchSettings, SearchState
 from fitting.inference.sensitivity import FreeTable
-from fitting.problem.free_parameters import free_parameter
+from fitting.motion import accuracy
+from fitting.motion.accuracy import NEGLIGIBLE, Difference, Remainder, summarise_differences
 from fitting.problem.problem import Problem
+from fitting.problem.space import free_parameter
+from fitting.report import style
+from fitting.report.formatting import (
+    DIFFERENCES,
+    Table,
+    aligned,
+    bullets,
+    joined,
+    markdown,
+    number,
+    percent,
+)
+from fitting.report.style import AFTER, BEFORE, EARTH, legend, styled
 from fitting.runtime import activity, files, validation
+from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
+from jaxik.maths import parameter_tree
 
-from . import run_folder
-from .animations import AnimationFiles, load_animation
+from .animations.animations import AnimationFiles, load_animation
+from .fit import fit_report, run_folder
+from .fit.fit import Fit
 
 # The source has no noise: these say how far apart two motions still count as the same.
 TOLERANCES = {
@@ -51,6 +71,10 @@ TOLERANCES = {
 MAX_SWEEPS = 20  # over the free parameters, before the search
 MIN_SWEEP_GAIN = 0.01  # relative fall of the cost that makes another sweep worthwhile
 SOURCE = "source.toml"
+
+NUMBERS = "translation.json"
+
+FAITHFUL = 0.95  # fraction of a correction from which on it counts as reproduced
 
 
 @dataclass(frozen=True)
@@ -247,8 +271,8 @@ def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None
 def _check_moves(source: NamedSystem, problem: Problem[jaxik.FootIK]) -> None:
     """Raises ValueError if the source leaves every clip as it is."""
     for scene in problem.data:
-        corrections = difference.correction(scene)
-        if any(series.max() > difference.NEGLIGIBLE for series in corrections.values()):
+        corrections = accuracy.correction(scene)
+        if any(series.max() > accuracy.NEGLIGIBLE for series in corrections.values()):
             return
     raise ValueError(f"{source.name} moves nothing in these clips: there is nothing to reproduce")
 
@@ -295,3 +319,237 @@ def save_source(run: Path, translation: Translation) -> None:
     for entry, data in zip(translation.experiment.clips, translation.clips, strict=True):
         motion = data.reference
         clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))
+
+
+@in_float64
+def differences(fitted: Fit) -> list[Difference]:
+    """What remains of the source's correction, for each clip."""
+    return [
+        accuracy.measure(scene, result)
+        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
+    ]
+
+
+def translation_text(translation: Translation, clips: Sequence[Difference]) -> str:
+    """The result of a translation, for the terminal."""
+    source, target = translation.source.name, translation.target.name
+    phases = accuracy.summarise_differences(clips)
+    parts = [headline(phases["all frames"], source, target)]
+    for phase, remainders in phases.items():
+        parts += ["", f"{phase.capitalize()}:"]
+        parts.append(aligned(table(remainders, source)))
+    return joined([*parts, "", *shortcomings(clips, source, target)])
+
+
+@in_float64
+def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> None:
+    """Writes parameters, numbers, plots and summary of a translation into the folder of its run."""
+    source, target = translation.source, translation.target
+    content = {
+        "source": source.name,
+        "target": target.name,
+        "reproduced": numbers(clips),
+        "clips": [numbers([clip]) for clip in clips],
+        "shortcomings": shortcomings(clips, source.name, target.name),
+    }
+    write_json(run / NUMBERS, content)
+    parameters = parameter_files.system_to_toml(fitted.ik, target.preset)
+    files.write_text(run / f"{target.preset.name}.toml", parameters)
+    opening = [*_opening(translation, fitted, clips), _plots(run, translation, clips)]
+    fit_report.write_fit(run, fitted, opening, _parameters_of_both(translation, fitted))
+
+
+def _plots(run: Path, translation: Translation, clips: Sequence[Difference]) -> str:
+    """Draws what remains of each clip; returns the plots as Markdown."""
+    source, target = translation.source.name, translation.target.name
+    lines = []
+    for number_of_clip, clip in enumerate(clips, 1):
+        several = len(clips) > 1
+        name = f"difference_{number_of_clip}.png" if several else "difference.png"
+        subject = f", clip {number_of_clip}" if several else ""
+        title = f"{translation.experiment.name}{subject}: what remains"
+        style.save(run / name, difference(clip, source, target, title))
+        lines.append(f"![{title}]({name})")
+    return "\n\n".join(lines)
+
+
+def _opening(translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> list[str]:
+    """The first section of the summary: how close the fit is, and what it cannot do."""
+    source, target = translation.names
+    phases = accuracy.summarise_differences(clips)
+    parts = [
+        f"## How much of {source} {target} reproduces",
+        headline(phases["all frames"], source, target),
+        "Reproduced is 1 - rms(what remains) / rms(source - animation): 100 % is the same motion, "
+        "0 % is no better than the animation, and negative is worse; – where the source corrects "
+        "nothing.",
+    ]
+    for phase, remainders in phases.items():
+        rows = table(remainders, source)
+        parts += [f"{phase.capitalize()}:", markdown(rows)]
+    if remarks := shortcomings(clips, source, target):
+        parts += [f"What {target} does not do as {source} does:", bullets(remarks)]
+    ends = zip(fitted.identifiability.names, fitted.identifiability.at_bound, strict=True)
+    if at_bound := [f"`{name}`" for name, end in ends if end]:
+        parts.append(f"At an end of their range, which may be too narrow: {', '.join(at_bound)}.")
+    free = translation.experiment.free
+    fixed = [f"`{n}`" for n in sensitivity.all_parameters(translation.target.ik) if n not in free]
+    reason = (
+        "as requested" if translation.free_was_chosen else "as they move nothing in these clips"
+    )
+    parts.append(
+        f"Parameters of {target} that kept their values, {reason}: {', '.join(fixed) or 'none'}. "
+        "The source has no noise; the sigmas of the fit (5 mm, 0.03 rad) say how far apart still "
+        "counts as the same, and so decide what is called determined below."
+    )
+    return parts
+
+
+def _parameters_of_both(translation: Translation, fitted: Fit) -> list[str]:
+    """The section with the values of both systems side by side."""
+    source, target = translation.names
+    iks = translation.source.ik, fitted.ik
+    leaves = [systems.leaf_names(ik) for ik in iks]
+    declarations = [parameter_tree.declarations(ik) for ik in iks]
+    table = [["parameter", "unit", source, f"{target}, fitted", "remarks"]]
+    free_leaves = {name.partition("[")[0] for name in translation.experiment.free}
+    for name in dict.fromkeys([*leaves[0], *leaves[1]]):
+        units = [declared[name].unit for declared in declarations if name in declared]
+        values = [
+            _value_text(parameter_tree.get(ik, name)) if name in own else "–"
+            for ik, own in zip(iks, leaves, strict=True)
+        ]
+        stage = name.partition(".")[0]
+        rules = {type(getattr(ik, stage)) for ik in iks}
+        remarks = ["fitted"] if name in free_leaves else []
+        remarks += ["of another rule"] if "–" not in values and len(rules) > 1 else []
+        table.append([f"`{name}`", units[0] if units else "", *values, ", ".join(remarks)])
+    return ["## Parameters of both systems", markdown(table)]
+
+
+def _value_text(value: Array) -> str:
+    """The values of a parameter, or the state of a switch."""
+    array = np.asarray(value)
+    formats = {"b": lambda x: "on" if x else "off", "f": lambda x: number(float(x))}
+    return ", ".join(formats.get(array.dtype.kind, str)(x) for x in array.ravel())
+
+
+def numbers(clips: Sequence[Difference]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Figures of each phase and quantity as JSON holds them, in the units of `DIFFERENCES`.
+
+    `correction` (rms); `rms`, `p95` and `max` of what remains; and `reproduced`, which is
+    1 - rms / correction, or None where the reference corrects nothing.
+    """
+    return {
+        phase: {name: _numbers(name, remainder) for name, remainder in remainders.items()}
+        for phase, remainders in summarise_differences(clips).items()
+    }
+
+
+def _numbers(quantity: str, remainder: Remainder) -> dict[str, float | None]:
+    factor = DIFFERENCES[quantity].factor
+    return {
+        "correction": factor * remainder.correction,
+        "rms": factor * remainder.rms,
+        "p95": factor * remainder.p95,
+        "max": factor * remainder.max,
+        "reproduced": remainder.reproduced,
+    }
+
+
+def table(remainders: Mapping[str, Remainder], source: str) -> Table:
+    """A row for each quantity of one phase.
+
+    Args:
+        remainders: by quantity.
+        source: name of the system that made the reference.
+    """
+    rows = [["", f"correction by {source}, rms", "remaining, rms", "95 %", "max", "reproduced"]]
+    for quantity, remainder in remainders.items():
+        name, unit, factor = DIFFERENCES[quantity]
+        values = remainder.correction, remainder.rms, remainder.p95, remainder.max
+        reproduced = "–" if remainder.reproduced is None else percent(remainder.reproduced)
+        rows.append([name, *(f"{factor * value:.2f} {unit}" for value in values), reproduced])
+    return rows
+
+
+def headline(remainders: Mapping[str, Remainder], source: str, target: str) -> str:
+    """How much of the source's correction the target reproduces, in one sentence."""
+    parts = [
+        f"{percent(remainder.reproduced)} of that of the {DIFFERENCES[quantity].name}"
+        for quantity, remainder in remainders.items()
+        if remainder.reproduced is not None
+    ]
+    return f"Of the correction that {source} makes, {target} reproduces {', '.join(parts)}."
+
+
+def shortcomings(clips: Sequence[Difference], source: str, target: str) -> list[str]:
+    """What the target does not do as the source does: a sentence each, with the worst place."""
+    sentences = []
+    for quantity, remainder in summarise_differences(clips)["all frames"].items():
+        name, unit, factor = DIFFERENCES[quantity]
+        remaining = f"{number(factor * remainder.rms)} {unit}"
+        worst = _worst(clips, quantity)
+        if remainder.reproduced is None:
+            if remainder.rms > NEGLIGIBLE:
+                sentences.append(
+                    f"{source} leaves the {name} as animated; {target} is {remaining} (rms) off, "
+                    f"{worst}."
+                )
+        elif remainder.reproduced < FAITHFUL:
+            correction = f"{number(factor * remainder.correction)} {unit}"
+            sentences.append(
+                f"{name.capitalize()}: {remaining} (rms) remain of {correction}, {worst}."
+            )
+    return sentences
+
+
+def _worst(clips: Sequence[Difference], quantity: str) -> str:
+    """Where what remains of a quantity is largest."""
+    _, unit, factor = DIFFERENCES[quantity]
+    index = int(np.argmax([clip.remaining[quantity].max() for clip in clips]))
+    clip, remaining = clips[index], clips[index].remaining[quantity]
+    frame, column = np.unravel_index(np.argmax(remaining), remaining.shape)
+    of_clip = f" of clip {index + 1}" if len(clips) > 1 else ""
+    of_leg = f" ({clip.legs[column]})" if remaining.shape[1] > 1 else ""
+    largest = number(factor * float(remaining[frame, column]))
+    return f"at most {largest} {unit} at {clip.time[frame]:.2f} s{of_clip}{of_leg}"
+
+
+@styled
+def difference(clip: Difference, source: str, target: str, title: str) -> Figure:
+    """Size of the source's correction, and of what remains of it under the target, over time."""
+    names = [
+        name
+        for name in DIFFERENCES
+        if max(clip.correction[name].max(), clip.remaining[name].max()) > NEGLIGIBLE
+    ]
+    figure = Figure(figsize=(17, 2.9 * max(len(names), 1) + 1.8), layout="constrained")
+    figure.suptitle(title)
+    rows = figure.subplots(max(len(names), 1), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, name in zip(rows, names, strict=False):
+        kind = DIFFERENCES[name]
+        of_legs = clip.remaining[name].shape[1] > 1
+        for series, colour in ((clip.correction, BEFORE), (clip.remaining, AFTER)):
+            axes.plot(clip.time, kind.factor * series[name].max(axis=1), color=colour)
+        axes.set_title(kind.name.capitalize() + (" (the larger of the legs)" if of_legs else ""))
+        axes.set_ylabel(kind.unit)
+        axes.set_ylim(bottom=0)
+        _shade(axes, clip)
+    rows[-1].set_xlabel("time, s")
+    rows[-1].set_xlim(clip.time[0], clip.time[-1])
+    entries: list[Line2D | Patch] = [
+        Line2D([], [], color=BEFORE, linewidth=3, label=f"{source} - animation: its correction"),
+        Line2D([], [], color=AFTER, linewidth=3, label=f"{source} - {target}: what remains"),
+    ]
+    if clip.standing.any():
+        entries.append(Patch(color=EARTH, label="the character stands"))
+    legend(figure, *entries)
+    return figure
+
+
+def _shade(axes: Axes, clip: Difference) -> None:
+    """Marks the time in which the character stands."""
+    edges = np.flatnonzero(np.diff(clip.standing.astype(int), prepend=0, append=0))
+    for start, end in edges.reshape(-1, 2):
+        axes.axvspan(float(clip.time[start]), float(clip.time[end - 1]), color=EARTH, zorder=0)

@@ -5,21 +5,23 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64, UInt8
 
 import jaxik
-from fitting.analysis import measures, placement
-from fitting.analysis.placement import Placement
-from fitting.datasets.clip_frames import clip_from_result
-from fitting.datasets.clips import Clip
+from fitting.clips import Clip, contacts
+from fitting.clips.clip_frames import clip_from_result
+from fitting.motion import measures
+from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Placement, Soles
+from fitting.motion.playback import stage_outputs
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64
+from jaxik.world import body
 from jaxik.world.similarity import similar
+from jaxik.world.terrain import Hit
 
-from .feet import Sight, seen
-from .lines import Colour, Lines, joined, lines
-from .overlays import overlays
-from .subject import Subject, Take
+from .subject import Colour, Lines, Subject, Take, crosses, joined, lines
+
+IN_GROUND, SLIDES = (230, 30, 30), (214, 39, 214)  # colours, RGB
 
 SKELETONS: dict[str, Colour] = {  # by name; the colours of reports
     "before": (140, 140, 140),
@@ -28,6 +30,71 @@ SKELETONS: dict[str, Colour] = {  # by name; the colours of reports
 }
 HEEL, BALL, ANKLE, TOE = range(4)  # corners of a foot as it is drawn
 EDGES = ((ANKLE, HEEL), (HEEL, BALL), (BALL, TOE))
+
+FOUND, MISSED = (0, 158, 115), (150, 150, 150)
+FOOTHOLD, LOCK, TARGET = (0, 114, 178), (230, 159, 0), (204, 61, 130)
+WITHIN, BEYOND = (0, 158, 115), (230, 30, 30)
+ARM = 0.05  # m, half a cross, for an adult
+NAMES = {
+    "rays": "Rays, grey where they miss",
+    "footholds": "Footholds (blue)",
+    "locks": "Locks (orange)",
+    "targets": "Targets of ankles (pink)",
+    "reach": "Reach, red beyond it",
+}
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a viewer sees of each foot in each frame."""
+
+    depth: Float64[np.ndarray, "frames legs"]
+    """m in the ground, 0 above it and without any."""
+    slide: Float64[np.ndarray, "frames legs"]
+    """m, horizontal path of the ball since its stance began, beyond the animated one; 0 in a
+    swing."""
+    size: float = 1.0
+    """Length of the legs relative to an adult's: what is visible is as many times as large."""
+
+    @property
+    def sunk(self) -> Float64[np.ndarray, "frames legs"]:
+        """How far a foot is in the ground, 0..1; 1 where `placement` counts it."""
+        return np.clip(self.depth / (VISIBLE * self.size), 0.0, 1.0)
+
+    @property
+    def slid(self) -> Float64[np.ndarray, "frames legs"]:
+        """How far a standing foot has slid, 0..1; 1 at the limit of `placement`."""
+        return np.clip(self.slide / (SLIDE_LIMIT * self.size), 0.0, 1.0)
+
+    def colours(self, plain: tuple[int, int, int]) -> UInt8[np.ndarray, "frames legs 3"]:
+        """The colour of each foot: plain, the redder the deeper, the more purple the further slid.
+
+        Args:
+            plain: of a foot with nothing wrong, RGB.
+        """
+        colours = np.full((*self.depth.shape, 3), plain, np.float64)
+        for share, colour in ((self.slid, SLIDES), (self.sunk, IN_GROUND)):
+            colours += share[..., None] * (np.array(colour) - colours)
+        return np.round(colours).astype(np.uint8)
+
+
+def seen(feet: Soles, motion: Clip, animated: Clip) -> Sight:
+    """What a viewer sees of the feet of a motion.
+
+    Args:
+        feet: of the motion.
+        motion: over the same frames.
+        animated: whose slides are not counted.
+    """
+    depth = np.maximum(-np.nan_to_num(feet.gap), 0.0)
+    steps = measures.horizontal_steps(motion.joints_ws(3), motion.cuts)
+    steps = steps - measures.horizontal_steps(animated.joints_ws(3), animated.cuts)
+    slide = np.zeros(depth.shape)
+    for leg in range(len(motion.rig.names)):
+        for first, last in contacts.runs(feet.stance[:, leg]):
+            slide[first + 1 : last + 1, leg] = np.cumsum(steps[first:last, leg])
+    slide[~feet.stance] = 0.0
+    return Sight(depth, np.maximum(slide, 0.0), body.ratio(motion.rig))
 
 
 @dataclass(frozen=True)
@@ -94,8 +161,8 @@ class Solver:
     @in_float64
     def _drawn(self, clip: Clip, name: str) -> Drawn:
         take = self.take
-        soles = placement.soles(clip, take.own_speed, take.terrain, take.floor)
-        placed = placement.assess(soles, clip, take.animated, own_speed=take.own_speed)
+        soles = measures.soles(clip, take.own_speed, take.terrain, take.floor)
+        placed = measures.assess(soles, clip, take.animated, own_speed=take.own_speed)
         sight = seen(soles, clip, take.own_speed)
         bones = np.array([[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0])
         starts, ends = np.moveaxis(clip.positions_ws[:, bones], 2, 0)
@@ -113,9 +180,56 @@ def result_of(ik: jaxik.FootIK, take: Take) -> jaxik.Result:
 
 def _feet(clip: Clip, colours: np.ndarray) -> Lines:
     """The soles of a motion, in a colour for each foot in each frame."""
-    heel_and_ball = measures.soles(clip)
+    heel_and_ball = measures.sole_points(clip)
     joints = np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
     corners = np.concatenate([heel_and_ball, joints], axis=2)
     return joined(
         *(lines(corners[:, :, start], corners[:, :, end], colours) for start, end in EDGES)
     )
+
+
+def overlays(result: jaxik.Result, solved: Clip) -> dict[str, Lines]:
+    """What is shown on demand, by name, in world space.
+
+    Args:
+        result: of a system.
+        solved: the clip as the system leaves it.
+    """
+    trace = stage_outputs(result)
+    sensed, advanced = trace.sensed, trace.advanced
+    arm = ARM * body.ratio(solved.rig)
+    found = np.asarray(sensed.foothold.found)
+    held_ws = np.asarray(advanced.foothold_ws) + np.asarray(advanced.hold.offset_ws)
+    target_ws = np.asarray(advanced.effector.target_ws)
+    hits = (sensed.ground.ankle, sensed.ground.toe, sensed.ground.corner)
+    up_ws = np.asarray(sensed.leg_up_ws)
+    up_ws = up_ws if up_ws.ndim == 3 else up_ws[:, None]
+    return {
+        "rays": joined(*(_rays(hit, up_ws) for hit in hits)),
+        "footholds": crosses(np.asarray(advanced.foothold_ws), found, arm, FOOTHOLD),
+        "locks": crosses(held_ws, np.asarray(advanced.hold.locked), 1.5 * arm, LOCK),
+        "targets": crosses(target_ws, found, arm, TARGET),
+        "reach": _reach(solved, target_ws),
+    }
+
+
+def _rays(hit: Hit, up_ws: np.ndarray) -> Lines:
+    """The rays that end in these hits; those that were not cast have no length."""
+    ends = np.asarray(hit.point)
+    starts = ends + np.asarray(hit.distance)[..., None] * up_ws
+    colours = np.where(np.asarray(hit.found)[..., None] > 0.5, _byte(FOUND), _byte(MISSED))
+    return lines(starts, ends, colours)
+
+
+def _reach(solved: Clip, target_ws: np.ndarray) -> Lines:
+    """From each hip to its ankle's target: as far as the leg reaches, and the rest."""
+    hips = solved.joints_ws(0)
+    length = np.asarray(solved.rig.thigh) + np.asarray(solved.rig.shin)
+    offset = target_ws - hips
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
+    ends = hips + np.minimum(length / distance, 1.0)[..., None] * offset
+    return joined(lines(hips, ends, WITHIN), lines(ends, target_ws, BEYOND))
+
+
+def _byte(colour: Colour) -> np.ndarray:
+    return np.array(colour, np.uint8)

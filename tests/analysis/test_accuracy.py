@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fitting.analysis import accuracy
-from fitting.analysis.accuracy import Accuracy
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import load_clip
-from fitting.report import fit_tables
-from fitting.report.labels import ACCURACY
+from fitting.clips import clip_frames, load_clip
+from fitting.motion import accuracy
+from fitting.motion.accuracy import Accuracy
+from fitting.report.formatting import ACCURACY
+from fitting.studies.fit import fit_tables
 from support.benchmark import scoring_program
 
-SCORE_KEYS = {  # keys of the scoring script, whose units are those of `labels.ACCURACY`
+SCORE_KEYS = {  # keys of the scoring script, whose units are those of `formatting.ACCURACY`
     "pelvis": "pelvis_height_cm",
     "ankle": "ankle_cm",
     "ankle_stance": "ankle_stance_cm",

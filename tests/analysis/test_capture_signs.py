@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fitting.analysis.capture_signs import ground, lag
+from fitting.studies.fit import capture_check
 
 FPS = 30.0
 STANCES = 12
@@ -39,13 +39,13 @@ def standing(height: float, scatter: float, tilt: float = 0.0) -> tuple[np.ndarr
     ],
 )
 def test_an_offset_of_the_ground_is_seen_where_it_is_clear(made, height, tilt):
-    found = ground.measure(*standing(*made))
+    found = capture_check.measure_ground(*standing(*made))
     assert found.stances == STANCES
     assert found.height == pytest.approx(height, abs=0.004)
     assert found.tilt_z == pytest.approx(tilt, abs=0.002) and abs(found.tilt_x) < 0.005
     gap, places, stance = standing(*made)
     gap[20:] = np.nan  # there is no ground but under the first stance
-    assert ground.measure(gap, places, stance).height == 0.0
+    assert capture_check.measure_ground(gap, places, stance).height == 0.0
 
 
 def playback(late: float, noise: float = 0.0, offset: float = 0.0) -> Any:
@@ -79,4 +79,4 @@ def playback(late: float, noise: float = 0.0, offset: float = 0.0) -> Any:
     ],
 )
 def test_a_capture_is_late_where_the_ankles_say_so(made, wanted):
-    assert lag.measure(playback(*made)) == pytest.approx(wanted, abs=0.004)
+    assert capture_check.measure_lag(playback(*made)) == pytest.approx(wanted, abs=0.004)

@@ -5,18 +5,19 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from fitting.analysis.goodness import distances, verdict
-from fitting.analysis.goodness.distances import (
+from fitting.motion import goodness
+from fitting.motion.goodness import (
     CLOSE,
     MOTIONS,
     PARTS,
     UNSEEN,
+    Assumed,
     Distances,
     Kinds,
     Motion,
     Part,
+    measure_groups,
 )
-from fitting.analysis.goodness.groups import Assumed, measure_groups
 from support.playbacks import FRAMES, SHAPES, playback
 
 NEAR = dict.fromkeys(CLOSE, 0.01)  # m and rad
@@ -34,7 +35,7 @@ def test_distances_are_those_of_the_frames_and_legs_that_were_captured():
     fitted = [playback(random_errors(0), **rows)]
     fitted.append(playback(random_errors(1), **rows, present=np.array([True, False])))
     before = [playback(random_errors(seed), **rows) for seed in (2, 3)]
-    measured = distances.measure(before, fitted).parts
+    measured = goodness.measure_distances(before, fitted).parts
     by_motion: dict[Motion, list] = {
         "animation": [clip.animated_errors for clip in fitted],
         "before": [clip.errors for clip in before],
@@ -50,7 +51,7 @@ def test_distances_are_those_of_the_frames_and_legs_that_were_captured():
                 expected = np.sqrt(np.mean(lengths**2))
                 assert measured[part][motion][kind] == pytest.approx(expected), (part, kind)
     unseen = playback(seen=np.zeros(FRAMES, bool))
-    assert distances.measure([unseen], [unseen]).parts == {}
+    assert goodness.measure_distances([unseen], [unseen]).parts == {}
 
 
 def of(fitted: dict, animation: dict, before: dict, part: Part = "fitted") -> Distances:
@@ -102,7 +103,7 @@ def test_the_verdict_is_about_what_is_seen(measured, setbacks, better, sentence)
     assert [(setback.kind, setback.other) for setback in measured.setbacks] == setbacks
     assert measured.better == better
     assumed = Assumed(counted=True)
-    judged = verdict.judge(measure_groups([playback()], [{}], assumed), assumed, measured)
+    judged = goodness.judge(measure_groups([playback()], [{}], assumed), assumed, measured)
     assert judged.sentence.startswith(sentence), judged.sentence
     assert judged.fits == sentence.startswith(("Fits", "Nothing"))
 

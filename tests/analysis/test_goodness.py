@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fitting.analysis import worst_window
-from fitting.analysis.goodness import distances, verdict
-from fitting.analysis.goodness.groups import Assumed, measure_groups
-from fitting.analysis.goodness.noise import MEDIAN
-from fitting.analysis.goodness.verdict import Verdict
-from fitting.analysis.playback import RESIDUAL_KINDS, Playback
-from fitting.analysis.worst_window import find_worst_window
+from fitting.motion import goodness, worst_window
+from fitting.motion.goodness import MEDIAN, Assumed, Verdict, measure_groups
+from fitting.motion.playback import RESIDUAL_KINDS, Playback
+from fitting.motion.worst_window import find_worst_window
 from fitting.problem.scene import Sigmas
 from fitting.problem.simulation import autoregression
 from support.playbacks import FPS, FRAMES, SHAPES, SIGMAS, error, playback
@@ -53,7 +50,7 @@ def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
     assumptions = Assumed(**assumed)
     given: list[dict[str, float]] = [dict.fromkeys(KINDS, correlation)]
     groups = measure_groups([whiten(play, correlation)], given, assumptions)
-    return verdict.judge(groups, assumptions, distances.measure([play], [play]))
+    return goodness.judge(groups, assumptions, goodness.measure_distances([play], [play]))
 
 
 # The verdict on simulated noise
@@ -142,7 +139,7 @@ def test_a_misfit_is_named_with_its_kind_size_and_time_unless_it_is_small():
 
 def test_only_tolerances_count_without_noise():
     def tolerated(play: Playback) -> Verdict:
-        return verdict.judge_tolerances(measure_groups([play], [{}], Assumed()))
+        return goodness.judge_tolerances(measure_groups([play], [{}], Assumed()))
 
     assert tolerated(playback()).fits
     assert tolerated(with_bump(playback(), "ankle", 0.9, slice(0, FRAMES))).fits

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.analysis import measures, placement
-from fitting.analysis.measures import FootStates, Measures
-from fitting.analysis.misplacement import likely_cause
-from fitting.analysis.placement import Soles
-from fitting.analysis.playback import Motion
-from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips.clip import Clip
-from fitting.datasets.synthetic import gait, walker
+from fitting.clips.clip import Clip
+from fitting.clips.clip_frames import raised
+from fitting.motion import measures
+from fitting.motion.measures import FootStates, Measures, Soles, likely_cause
+from fitting.motion.playback import Motion
+from fitting.synthetic import footsteps, walker
 from jaxik.world import terrain
 from support.grounds import flight, hill, terrain_of
 from support.sample_clips import seen_within
@@ -184,13 +182,11 @@ def moved(clip: Clip, joint: int, offset: np.ndarray) -> Clip:
     return clip.with_motion(positions, clip.rotations_ws)
 
 
-def assess(gap: np.ndarray, stance: np.ndarray, clip: Clip) -> placement.Placement:
+def assess(gap: np.ndarray, stance: np.ndarray, clip: Clip) -> measures.Placement:
     """Of the first frames of a clip, whose two points of each sole have the same height."""
     height = np.repeat(np.asarray(gap, float)[..., None], 2, axis=-1)
     cut = clip.select(slice(0, len(gap)))
-    return placement.assess(
-        Soles(height, np.where(np.isnan(height), np.nan, 0.0), stance), cut, cut
-    )
+    return measures.assess(Soles(height, np.where(np.isnan(height), np.nan, 0.0), stance), cut, cut)
 
 
 def hill_height(z: np.ndarray) -> np.ndarray:
@@ -203,12 +199,12 @@ def hill_height(z: np.ndarray) -> np.ndarray:
 def test_soles_are_as_high_as_a_reference_of_rotations_and_interpolation_says(walk):
     """Points below ankle and ball along the foot's up; the ground by interpolation over z."""
     lifted = raised(walk, np.linspace(0.0, 0.4, walk.frame_count))
-    feet = placement.soles(lifted, walk, terrain_of(hill()))
+    feet = measures.soles(lifted, walk, terrain_of(hill()))
     for leg in range(2):
         ankle_rot = lifted.rotations_ws[:, lifted.rig.joints[leg][2]]
         foot_rot = np.asarray(lifted.rig.ankle_from_foot)[leg]
         up = rotation(ankle_rot).apply(rotation(foot_rot).apply([0.0, 1.0, 0.0]))
-        for point, depth in enumerate((gait.ANKLE_HEIGHT, gait.BALL_HEIGHT)):
+        for point, depth in enumerate((footsteps.ANKLE_HEIGHT, footsteps.BALL_HEIGHT)):
             sole = lifted.joints_ws(2 + point)[:, leg] - depth * up
             ground = hill_height(sole[:, 2])
             np.testing.assert_allclose(feet.ground[:, leg, point], ground, atol=1e-5)
@@ -218,8 +214,8 @@ def test_soles_are_as_high_as_a_reference_of_rotations_and_interpolation_says(wa
 def test_the_ground_is_found_above_a_sole_deep_in_it_and_below_a_roof(walk):
     for height in (0.8, -0.5):
         mesh = terrain.combine(terrain.plane((0.0, height, 0.0)), terrain.plane((0.0, 5.0, 0.0)))
-        np.testing.assert_allclose(placement.soles(walk, walk, mesh).ground, height)
-    stairs = placement.soles(walk, walk, terrain_of(flight([1.0, 2.0, 3.0], rise=0.5)))
+        np.testing.assert_allclose(measures.soles(walk, walk, mesh).ground, height)
+    stairs = measures.soles(walk, walk, terrain_of(flight([1.0, 2.0, 3.0], rise=0.5)))
     assert stairs.height.min() == pytest.approx(-1.5, abs=0.05), "from the tread above"
 
 
@@ -255,7 +251,7 @@ def test_feet_are_misplaced_where_over_five_per_cent_are_visibly_off_or_without_
 def test_a_slide_is_the_path_of_the_ball_beyond_the_animated_one(walk):
     x = 0.001 * np.arange(walk.frame_count)
     sliding = moved(walk, 3, x[:, None] * [1.0, 0.0, 0.0])
-    placed = placement.assess(placement.soles(walk, walk, FLOOR), sliding, walk)
+    placed = measures.assess(measures.soles(walk, walk, FLOOR), sliding, walk)
     lengths = []
     for stance, ball in zip(walk.stance_labels().T, sliding.joints_ws(3)[..., 0].T, strict=True):
         cuts = np.flatnonzero(np.diff(stance)) + 1
@@ -267,25 +263,25 @@ def test_a_slide_is_the_path_of_the_ball_beyond_the_animated_one(walk):
 
 
 def test_a_walk_stands_on_its_floor_and_a_pop_is_a_jump_of_an_ankle_from_the_pelvis(walk):
-    soles = placement.soles(walk, walk, FLOOR)
-    placed = placement.assess(soles, walk, walk)
+    soles = measures.soles(walk, walk, FLOOR)
+    placed = measures.assess(soles, walk, walk)
     assert placed.slide == placed.largest_slide.value == placed.pop.value == 0.0
     assert placed.sunk == placed.floating == placed.sunk_frames == placed.groundless == 0.0
     assert not placed.misplaced
     step = np.where(np.arange(walk.frame_count) >= 77, 0.06, 0.0)[:, None] * [0.0, 1.0, 0.0]
-    pop = placement.assess(soles, moved(walk, 2, step), walk).pop
+    pop = measures.assess(soles, moved(walk, 2, step), walk).pop
     assert (pop.value, pop.frame, pop.leg) == (pytest.approx(0.06), 77, "left")
     whole = walk.with_motion(walk.positions_ws + step[:, None], walk.rotations_ws)
-    assert placement.assess(soles, whole, walk).pop.value == pytest.approx(0.0, abs=1e-12)
+    assert measures.assess(soles, whole, walk).pop.value == pytest.approx(0.0, abs=1e-12)
     still = walk.select(slice(0, 1))
-    placed = placement.assess(placement.soles(still, still, FLOOR), still, still)
+    placed = measures.assess(measures.soles(still, still, FLOOR), still, still)
     assert np.isnan([placed.slide, placed.pop.value]).all(), "of one frame"
 
 
 def test_feet_are_not_measured_in_masked_frames(walk):
     clip = seen_within(dataclasses.replace(walk, stance=walk.stance_labels()), 100, 300)
     lifted = raised(clip, np.where(clip.observed, 0.0, 0.05))
-    placed = placement.assess(placement.soles(lifted, clip, FLOOR), lifted, clip)
+    placed = measures.assess(measures.soles(lifted, clip, FLOOR), lifted, clip)
     assert placed.floating == placed.sunk == placed.groundless == 0.0
     assert placed.highest.value < 0.01
 
@@ -307,4 +303,4 @@ def test_the_cause_of_misplaced_feet_is_named_with_its_size(walk):
         rows.append((unit * heights, ground, ("units", pytest.approx(unit))))
     for height, below, expected in rows:
         clip = raised(walk, height)
-        assert likely_cause(placement.soles(clip, walk, below), clip) == expected
+        assert likely_cause(measures.soles(clip, walk, below), clip) == expected

@@ -16,23 +16,19 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.analysis.evidence import find_evidence
-from fitting.analysis.missing_motion import AT_LIMITS, EVENTS, describe_missing_motion
-from fitting.analysis.playback import play_all
-from fitting.datasets.clips import Clip
-from fitting.datasets.synthetic import actions, walker
-from fitting.datasets.synthetic.speed_profile import Slip
-from fitting.datasets.synthetic.walker import WalkStyle
-from fitting.experiments.problems import ClipData, make_scene
+from fitting.clips import Clip
+from fitting.experiment.problems import ClipData, make_scene
 from fitting.inference.profiles.profile import Profile, make_profile
-from fitting.problem.free_parameters import free_parameter, from_fractions, present_value
-from fitting.problem.loss import rho
-from fitting.problem.problem import Problem
+from fitting.motion.evidence import AT_LIMITS, EVENTS, describe_missing_motion, find_evidence
+from fitting.motion.playback import play_all
+from fitting.problem.problem import Problem, rho
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
 from fitting.problem.shared_world import run_scenes
-from fitting.problem.space import make_space
+from fitting.problem.space import free_parameter, from_fractions, make_space, present_value
 from fitting.runtime.precision import with_floats
+from fitting.synthetic import actions, walker
+from fitting.synthetic.walker import Slip, WalkStyle
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.probe import FootProbe

@@ -14,25 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.bench import host, measurement, report, roofline, runner, sizes, suite, workloads
-from fitting.bench.benchmarks import (
-    baselines,
-    ceilings,
-    cold_fit,
-    crowd,
-    inference,
-    kernels,
-    live,
-    many,
-    scaling,
-)
-from fitting.bench.measurement import Figure, FigureSpec, Measurement, Series
+from fitting.bench import fits, kernels, measurement, report, roofline, suite, throughput, workloads
+from fitting.bench.measurement import Benchmark, Figure, FigureSpec, Measurement, Series
 from fitting.bench.roofline import Work
-from fitting.bench.runner import Benchmark
-from fitting.bench.sizes import Sizes
+from fitting.bench.workloads import Sizes
 from fitting.cli import main
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.inference.optimisation.search import find_best_fit
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.inference.optimise.search import find_best_fit
 from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
@@ -84,14 +72,14 @@ def test_calls_run_in_turns_in_random_order_and_compiling_is_timed_separately(mo
 
 
 def test_peak_memory_counts_from_the_last_reset():
-    if np.isnan(host.peak_memory_mb()):
+    if np.isnan(measurement.peak_memory_mb()):
         pytest.skip("this system does not report peak memory")
     large = np.ones(20_000_000)
     del large
-    host.reset_peak_memory()
-    before = host.peak_memory_mb()
+    measurement.reset_peak_memory()
+    before = measurement.peak_memory_mb()
     large = np.ones(10_000_000)
-    assert host.peak_memory_mb() - before > 0.9 * large.nbytes / 1e6
+    assert measurement.peak_memory_mb() - before > 0.9 * large.nbytes / 1e6
 
 
 def test_a_timing_has_its_spread_its_cpu_time_and_its_limit_and_so_has_a_ratio():
@@ -174,7 +162,9 @@ def trivial_suite(monkeypatch):
         timings.add(Figure("before", 1.0, "s"))
         raise KeyboardInterrupt
 
-    child = runner.subprocess.CalledProcessError(1, "python", stderr="Traceback\nKeyError: 'a'\n")
+    child = measurement.subprocess.CalledProcessError(
+        1, "python", stderr="Traceback\nKeyError: 'a'\n"
+    )
     benchmarks = {
         "full": Benchmark("a row that fails", "", Mock(side_effect=MemoryError)),
         "child": Benchmark("a row whose process fails", "", Mock(side_effect=child)),
@@ -203,19 +193,19 @@ def test_the_command_prints_a_table_with_the_hardware_and_its_json_is_complete(
     assert str(numbers) in capsys.readouterr().out and (tmp_path / "bench.png").is_file()
     content = json.loads(numbers.read_text())
     assert not content["quick"] and not content["interrupted"]
-    assert set(content["machine"]) == {*host.Hardware.__annotations__, "load"}
+    assert set(content["machine"]) == {*measurement.Hardware.__annotations__, "load"}
     assert len(content["machine"]["load"]) == 2  # at the start and at the end
     assert (None in content["machine"]["load"]) != hasattr(os, "getloadavg")
     (row,) = content["rows"]
     assert row["name"] == "quick" and row["floats"] == "float32"
     assert [figure["met"] for figure in row["figures"]] == [True, False]
     samples = row["samples"]
-    assert set(samples) == {"ours", "theirs"} and len(samples["ours"]) == sizes.FULL.repeats
+    assert set(samples) == {"ours", "theirs"} and len(samples["ours"]) == workloads.FULL.repeats
     assert row["medians"] == {name: np.median(each) for name, each in samples.items()}
     assert row["series"][0]["slopes"] == {"ours": pytest.approx(1.0)}
     timings = Measurement("x", "x", 1, load=np.nan)  # what is not finite is null
     timings.add(Figure("memory", np.nan, "MB", limit=np.inf))
-    (row,) = json.loads(report.to_json(runner.Report(False, [timings])))["rows"]
+    (row,) = json.loads(report.to_json(measurement.Report(False, [timings])))["rows"]
     assert row["figures"][0]["value"] is row["figures"][0]["limit"] is row["load"] is None
 
 
@@ -249,7 +239,7 @@ def test_a_mistake_in_the_options_is_reported_before_anything_is_measured(
 
 def test_a_quick_run_has_smaller_sizes_and_no_long_benchmarks_unless_they_are_named():
     for field in dataclasses.fields(Sizes):
-        quick, full = (getattr(values, field.name) for values in (sizes.QUICK, sizes.FULL))
+        quick, full = (getattr(values, field.name) for values in (workloads.QUICK, workloads.FULL))
         if isinstance(full, tuple):
             quick, full = sorted(quick), sorted(full)
         assert quick <= full or quick[-1] <= full[-1], field.name
@@ -284,10 +274,10 @@ def legs():
         yield every
 
 
-def run_suite(name: str, sizes: Sizes = SMALL) -> runner.Report:
+def run_suite(name: str, sizes: Sizes = SMALL) -> measurement.Report:
     """Runs the benchmark of the ceilings and this one."""
     benchmarks = suite.choose(suite.BENCHMARKS, name)
-    return runner.run_benchmarks(benchmarks, sizes, True, lambda line: None)
+    return measurement.run_benchmarks(benchmarks, sizes, True, lambda line: None)
 
 
 def measure(name: str, **changes) -> Measurement:
@@ -312,7 +302,7 @@ def test_the_ceilings_of_the_machine_are_its_best_runs():
 
 def test_import_times_do_not_include_that_of_jax(monkeypatch):
     commands = []
-    monkeypatch.setattr(ceilings.subprocess, "run", lambda command, check: commands.append(command))
+    monkeypatch.setattr(kernels.subprocess, "run", lambda command, check: commands.append(command))
     timings = measure("start", repeats=1)
     seconds = {name: samples[0] for name, samples in timings.samples.items()}
     figure = figures(timings)["import jaxik, beyond jax's"]
@@ -331,7 +321,7 @@ def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs,
     assert figures(measure("feet"))["a leg and core"].at_most == 110.0
     corrections = kernels.leg_corrections(legs.ik, legs.lanes)
     ours = [np.asarray(rotations)[0].T for rotations in corrections]
-    theirs = baselines.two_bone(*kernels.numpy_arguments(legs))
+    theirs = kernels.two_bone(*kernels.numpy_arguments(legs))
     for our_rot, their_rot in zip(ours, theirs, strict=True):
         assert_close(np.abs(np.sum(our_rot * their_rot, axis=-1)), np.ones(200), 1e-4)
         assert np.ptp(our_rot[:, 0]) > 1e-3  # the legs differ
@@ -343,7 +333,7 @@ def test_rays_are_compared_with_embree_where_it_is_installed(monkeypatch):
     first = "Embree, which triangle"
     ratio = np.median(timings.samples[first]) / np.median(timings.samples["ours"])
     assert figures(timings)[f"{first}: its time in ours"].value == pytest.approx(ratio)
-    monkeypatch.setattr(kernels.mesh_files, "embree_tracer", lambda vertices, faces: None)
+    monkeypatch.setattr(kernels.meshes, "embree_tracer", lambda vertices, faces: None)
     timings = measure("rays")
     assert list(timings.samples) == ["ours"] and "not installed" in timings.notes[0]
 
@@ -366,7 +356,9 @@ def test_a_crowd_in_chunks_is_the_whole_crowd():
         people = workloads.crowd(5, 24)
         flat = workloads.single(kernels.plane())
         timings = Measurement("crowd", "crowd", 1)
-        parts = crowd.in_chunks(timings, "plane", places, crowd.CrowdScene(people, flat, 2))()
+        parts = throughput.in_chunks(
+            timings, "plane", places, throughput.CrowdScene(people, flat, 2)
+        )()
         parts = [jnp.moveaxis(part, -1, 0) for part in parts]  # members are last
         whole = jax.vmap(lambda member: places(people, flat, member))(people.members)
     first, second, last = parts
@@ -381,9 +373,9 @@ def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(mon
     def outputs(ik, crowd, ground, frames):
         return (ik.leg.soften * frames.pose.ankle.pos + ground.up_ws,)
 
-    monkeypatch.setattr(crowd, "_outputs", outputs)
+    monkeypatch.setattr(throughput, "_outputs", outputs)
     of_crowd = figures(measure("crowd"))
-    wider = 1.0 / host.time_in_width()
+    wider = 1.0 / measurement.time_in_width()
     assert of_crowd["plane, leg-frames a second"].at_least == pytest.approx(9.0 * wider)
     assert of_crowd["mesh, leg-frames a second"].at_least == pytest.approx(5.0 * wider)
     assert of_crowd["peak of memory"].value > 50.0
@@ -407,13 +399,13 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
 
 
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
-    subject = live.subject(12)
+    subject = throughput.subject(12)
     (take,), (system,) = subject.takes, subject.starts.values()
-    assert take.base.fps == live.RATE and take.base.frame_count == 6
+    assert take.base.fps == throughput.RATE and take.base.frame_count == 6
     assert system.leg is not None and subject.cost is not None
     problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
-    count = max(sizes.FULL.parameters)
+    count = max(workloads.FULL.parameters)
     names = workloads.parameter_names(count)
     assert len(set(names)) == len(names) == count and set(problem.space.names) < set(names)
 
@@ -436,17 +428,17 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
 
     def run(command, env, **options):
         processes.append((command[1:], env["JAX_COMPILATION_CACHE_DIR"], env["JAX_ENABLE_X64"]))
-        assert cold_fit.load_clip(Path(command[-1], cold_fit.CLIPS[0])).frame_count == 12
-        return cold_fit.subprocess.CompletedProcess(command, 0, "1.00\n")
+        assert fits.load_clip(Path(command[-1], fits.CLIPS[0])).frame_count == 12
+        return fits.subprocess.CompletedProcess(command, 0, "1.00\n")
 
-    monkeypatch.setattr(cold_fit.subprocess, "run", run)
+    monkeypatch.setattr(fits.subprocess, "run", run)
     timings = measure("fit")
     of_fit = figures(timings)
     assert of_fit["warm"].at_most == 2.0
     assert of_fit["cold, empty cache"].at_most == 20.0
     assert of_fit["cold, persistent cache"].at_most == 5.0
     (empty, empty_cache, x64), (full, full_cache, _) = processes
-    assert empty == full and empty[:2] == ["-m", cold_fit.__name__]
+    assert empty == full and empty[:2] == ["-m", fits.__name__]
     assert empty_cache == full_cache and x64 == "1"
     assert sum("cost" in figure.note for figure in timings.figures) == 3
     assert timings.samples["its search, empty cache"] == [1.0]
@@ -455,7 +447,7 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
     def interrupted(problem, progress):
         return dataclasses.replace(find_best_fit(problem), interrupted=True)
 
-    monkeypatch.setattr(inference, "find_best_fit", interrupted)
+    monkeypatch.setattr(fits, "find_best_fit", interrupted)
     stopped = run_suite("fit")
     assert stopped.interrupted and stopped.measurements[-1].figures == []
 
@@ -476,10 +468,10 @@ def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_ste
 def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     systems = []
     ik, clip = presets.record(), workloads.walk(12)
-    subject = SimpleNamespace(starts={live.DEFAULT: ik}, rig=clip.rig)
+    subject = SimpleNamespace(starts={throughput.DEFAULT: ik}, rig=clip.rig)
     solver = SimpleNamespace(solve=systems.append, take=SimpleNamespace(base=clip))
-    monkeypatch.setattr(live, "subject", lambda frame_count: subject)
-    monkeypatch.setattr(live, "Solver", lambda subject: solver)
+    monkeypatch.setattr(throughput, "subject", lambda frame_count: subject)
+    monkeypatch.setattr(throughput, "Solver", lambda subject: solver)
     timings = measure("view")
     (figure,) = timings.figures
     assert figure.at_most == 100.0 and figure.unit == "ms"
@@ -491,7 +483,7 @@ def test_a_drag_is_measured_without_its_compilation(monkeypatch):
 
 
 def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, legs, tmp_path, monkeypatch):
-    monkeypatch.setattr(scaling, "run", lambda ik, rig, ground, motion: 2 * motion.weight)
+    monkeypatch.setattr(throughput, "run", lambda ik, rig, ground, motion: 2 * motion.weight)
     measured = run_suite("scaling")
     timings = measured.measurements[-1]
     assert [series.size for series in timings.series] == [
@@ -517,10 +509,10 @@ def measured(what: str, count: int) -> dict[str, float]:
 
 
 def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch):
-    monkeypatch.setattr(many, "_measured", measured)
-    monkeypatch.setattr(many, "usable_cores", lambda: 2)
+    monkeypatch.setattr(throughput, "_measured", measured)
+    monkeypatch.setattr(throughput, "usable_cores", lambda: 2)
     sizes = dataclasses.replace(SMALL, devices=(1, 4, 5, 8), clips=(10, 20, 30), workers=(1, 2))
-    many.many(timings := Measurement("many", "", 1), sizes)
+    throughput.many(timings := Measurement("many", "", 1), sizes)
     assert timings.notes[:2] == [
         "left out: 5, 8 devices, as two share each core already",
         "left out: 30 clips, as 20 failed",
@@ -529,15 +521,15 @@ def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch)
     assert [series.sizes for series in timings.series] == [[1, 4], [10], [1, 2]]
     assert figures(timings)["8 fits, 2 workers: CPU time"].value == 4.0
 
-    monkeypatch.setattr(many, "LONGEST", -1.0)
-    many.many(slow := Measurement("many", "", 1), sizes)
+    monkeypatch.setattr(throughput, "LONGEST", -1.0)
+    throughput.many(slow := Measurement("many", "", 1), sizes)
     assert [series.sizes for series in slow.series] == [[1], [10], [1]]
     assert slow.notes[0] == "left out: 4, 5, 8 devices, as 1 took 0 s"
 
 
 def test_many_keeps_what_was_measured_before_an_interrupt(monkeypatch, tmp_path):
-    monkeypatch.setattr(many, "_measured", measured)
-    monkeypatch.setattr(many, "usable_cores", lambda: 2)
+    monkeypatch.setattr(throughput, "_measured", measured)
+    monkeypatch.setattr(throughput, "usable_cores", lambda: 2)
     timings = run_suite("many", dataclasses.replace(SMALL, devices=(1, 2), clips=(40,)))
     assert timings.interrupted
     numbers, curves = tmp_path / "bench.json", tmp_path / "bench.png"

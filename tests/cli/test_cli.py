@@ -22,19 +22,18 @@ from fitting.cli import main, progress, start, without_jax
 from fitting.cli.commands import COMMANDS
 from fitting.cli.parser import make_parser
 from fitting.cli.parsers.guides import SHELLS
-from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips import formats, load_clip, save_clip
-from fitting.datasets.coverage import GroundWarning
-from fitting.datasets.synthetic import walker
-from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
-from fitting.datasets.terrain.meshes import mesh_of
-from fitting.experiments import systems
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.schema.experiment_schema import experiment_schema
-from fitting.inference.optimisation.solution import Progress
-from fitting.jobs import examples
+from fitting.clips import formats, load_clip, save_clip
+from fitting.clips.clip_frames import raised
+from fitting.experiment import systems
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.schema import experiment_schema
+from fitting.ground.coverage import GroundWarning
+from fitting.ground.meshes import load_terrain, mesh_of, save_mesh
+from fitting.inference.optimise.solution import Progress
 from fitting.runtime import activity
-from fitting.studies.animations import AnimationFiles
+from fitting.studies import exports
+from fitting.studies.animations.animations import AnimationFiles
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from support import gltf_files, grounds
 from support.commands import commands, refusal
@@ -46,8 +45,8 @@ DATA = ROOT / "data"
 BASE, GROUND = DATA / "clips" / "uneven_walk_base.npz", DATA / "terrains" / "slope.ply"
 FILES = {"DATA": DATA, "BASE": BASE, "GROUND": GROUND}
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::fitting.datasets.coverage.GroundWarning",
-    "always::fitting.report.placement_report.PlacementWarning",
+    "ignore::fitting.ground.coverage.GroundWarning",
+    "always::fitting.studies.animations.placement_report.PlacementWarning",
 )
 
 
@@ -492,10 +491,10 @@ def test_schema_is_written_as_json_and_lists_every_key(tmp_path, capsys):
 def test_a_copied_example_is_whole_and_names_its_schema(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     elsewhere = {"blocks", "blocks_walk", "blocks_causal"}  # whose clips are not in the repository
-    assert len(examples.names().keys() - elsewhere) == 15
+    assert len(exports.names().keys() - elsewhere) == 15
     assert main.main(["example", name, "-o", "copy"]) == 0
     path = tmp_path / "copy" / f"{Path(name).name}.toml"
-    loaded, original = load_experiment(path), load_experiment(examples.path_of(name))
+    loaded, original = load_experiment(path), load_experiment(exports.path_of(name))
     for part in ("free", "prior", "sigmas"):
         assert getattr(loaded, part) == getattr(original, part)
     for clip, source in zip(loaded.clips, original.clips, strict=True):
@@ -534,7 +533,7 @@ def test_bash_completes_commands_options_choices_and_files(tmp_path, capsys):
     assert main.main(["completion", "bash"]) == 0
     (tmp_path / "jaxik.bash").write_text(capsys.readouterr().out)
     words = [line.replace(" ", "|") + "|\n" for line in COMPLETED]  # an empty last word counts
-    command = ["bash", "-c", SCRIPT, "bash", str(examples.REPOSITORY / "experiments")]
+    command = ["bash", "-c", SCRIPT, "bash", str(exports.REPOSITORY / "experiments")]
     said = subprocess.check_output(
         command, env={"PATH": "/usr/bin:/bin"}, cwd=tmp_path, input="".join(words), text=True
     )

@@ -12,10 +12,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from fitting.cli import main, without_jax
-from fitting.cli.doctor import examination, installation, machine, self_test
-from fitting.cli.doctor.findings import Finding, from_json
-from fitting.experiments import problems
+from fitting.cli import examination, main, self_test, without_jax
+from fitting.cli.examination import Finding, from_json
+from fitting.experiment import problems
 from support import quick
 from support.experiments import ROOT
 
@@ -45,7 +44,7 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
 
 
 def test_a_flag_that_ends_the_process_is_a_line_with_a_remedy(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(installation, "examine", lambda: iter(()))
+    monkeypatch.setattr(examination, "examine_installation", lambda: iter(()))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("XLA_FLAGS", "--xla_nonsense=1")
     assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
@@ -104,9 +103,9 @@ def test_the_self_test_sees_wrong_numbers(cost, slope, errors, problem, monkeypa
 def test_a_file_that_hides_a_package_is_named_and_does_not_hide_it_from_the_command(tmp_path):
     for name in ("fitting.py", "jaxik.py"):
         (tmp_path / name).write_text("raise RuntimeError('of the folder')\n", encoding="utf-8")
-    problem = " ".join(finding.problem for finding in installation._names_in(tmp_path))
+    problem = " ".join(finding.problem for finding in examination._names_in(tmp_path))
     assert f"{tmp_path / 'fitting.py'} hides the package fitting" in problem
-    assert not list(installation._names_in(ROOT))
+    assert not list(examination._names_in(ROOT))
     command = Path(sys.executable).with_name("jaxik")
     if not command.is_file():
         pytest.skip("jaxik is not installed")
@@ -117,12 +116,12 @@ def test_a_file_that_hides_a_package_is_named_and_does_not_hide_it_from_the_comm
 
 def test_a_missing_and_an_old_package_are_problems_and_an_extra_only_if_it_is_broken(monkeypatch):
     needed = ["numpy>=99", "surely-not-installed>=1"]
-    monkeypatch.setattr(installation.metadata, "requires", lambda name: needed)
-    said = [finding.problem for finding in installation.examine() if finding.problem]
+    monkeypatch.setattr(examination.metadata, "requires", lambda name: needed)
+    said = [finding.problem for finding in examination.examine_installation() if finding.problem]
     numpy = f"numpy is {metadata.version('numpy')}, wanted >=99"
     assert said == [f"{numpy}; surely-not-installed is missing"]
     needed = ["surely-not-installed; extra == 'dask'", "pdoc>=99; extra == 'posterior'"]
-    findings = {finding.subject: finding for finding in installation.examine()}
+    findings = {finding.subject: finding for finding in examination.examine_installation()}
     assert 'surely-not-installed; pip install "jaxik[dask]"' in findings["extra dask"].fact
     assert not findings["extra dask"].problem
     assert "pdoc is" in findings["extra posterior"].problem
@@ -132,11 +131,11 @@ def test_a_missing_and_an_old_package_are_problems_and_an_extra_only_if_it_is_br
 def test_little_memory_and_an_examination_that_fails_itself_are_problems(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(machine, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(examination, "MEMORY", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemTotal: 4000000 kB\nMemAvailable: 500000 kB\n")
-    (*_, memory) = machine.examine()
+    (*_, memory) = examination.examine_machine()
     assert memory.fact == "4.0 GB, 0.5 GB of them free" and "only 0.5 GB" in memory.problem
-    monkeypatch.setattr(machine, "examine", Mock(side_effect=OSError("no such device")))
+    monkeypatch.setattr(examination, "examine_machine", Mock(side_effect=OSError("no such device")))
     monkeypatch.setattr(examination, "_in_other_process", lambda options: iter([Finding("a", "b")]))
     assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
     out = capsys.readouterr().out

@@ -11,13 +11,12 @@ import threading
 
 import pytest
 
-from fitting.cli import main
-from fitting.cli.terminal import plain_lines, printing, show, watched
-from fitting.cli.terminal.plain_lines import PlainLines
-from fitting.jobs import examples
+from fitting.cli import main, terminal
+from fitting.cli.terminal import PlainLines, show, watched
 from fitting.report.formatting import aligned, joined
-from fitting.report.guides.layout import wrapped
+from fitting.report.guides import wrapped
 from fitting.runtime import activity
+from fitting.studies import exports
 from support.watching import Recorder
 
 ESCAPE, RULE = "\x1b", "─"
@@ -59,7 +58,7 @@ def test_a_terminal_gets_drawn_tables_that_fit_its_width_and_a_pipe_plain_text(m
     drawn = on_terminal(monkeypatch, lambda: main.main(["example"]))
     assert main.main(["example"]) == 0
     plain = capsys.readouterr()
-    rows = [["name", "experiment"], *([name, title] for name, title in examples.names().items())]
+    rows = [["name", "experiment"], *([name, title] for name, title in exports.names().items())]
     assert plain.out == f"{aligned(rows)}\n" and plain.err == ""
     assert ESCAPE in drawn and RULE in drawn
     assert all(name in drawn and title[:20] in drawn for name, title in rows)
@@ -172,7 +171,7 @@ def work_for_a_while() -> None:
 
 
 def test_a_terminal_gets_bars_and_results_above_them(monkeypatch):
-    monkeypatch.setattr(plain_lines, "PATIENCE", 1.5)
+    monkeypatch.setattr(terminal, "PATIENCE", 1.5)
     seconds = itertools.count()
     monkeypatch.setattr(activity.time, "monotonic", lambda: float(next(seconds)))
     drawn = on_terminal(monkeypatch, work_for_a_while, 100)
@@ -194,8 +193,8 @@ def test_a_pipe_and_dumb_strange_and_closed_terminals_get_plain_lines(monkeypatc
     for encoding, wanted in (("utf-8", True), ("latin-1", False)):
         stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-        assert printing.can_draw(stream) is wanted
-    assert not printing.can_draw(None)
+        assert terminal.can_draw(stream) is wanted
+    assert not terminal.can_draw(None)
 
 
 class Clock:
@@ -204,8 +203,8 @@ class Clock:
     def __init__(self, monkeypatch):
         self.now = 0.0
         for name, seconds in {"PATIENCE": 1.5, "INTERVAL": 10.0, "SILENCE": 60.0}.items():
-            monkeypatch.setattr(plain_lines, name, seconds)
-        monkeypatch.setattr(plain_lines.time, "monotonic", lambda: self.now)
+            monkeypatch.setattr(terminal, name, seconds)
+        monkeypatch.setattr(terminal.time, "monotonic", lambda: self.now)
         self._stream = io.StringIO()
         self.lines = PlainLines(self._stream)
 

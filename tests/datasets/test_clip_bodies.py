@@ -11,17 +11,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips import edit, load_clip, rigs, save_clip
-from fitting.datasets.clips.contacts import detect_stances, runs
-from fitting.datasets.clips.footing.noise import amplitude
-from fitting.datasets.clips.formats.bvh import read_bvh
-from fitting.datasets.clips.joint_roles import Trunk, find_roles, find_trunk, partners
-from fitting.datasets.clips.joints.map_files import read_joint_map, template
-from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.clips.load import ClipOptions, draft_joint_map
-from fitting.datasets.clips.rigs import LegMotion
-from fitting.datasets.clips.summary import as_json, as_text, describe
-from fitting.datasets.flat_animation import load_flat_animation
+from fitting.clips import edit, load_clip, rigs, save_clip
+from fitting.clips.clip import local_from_world, world_from_local
+from fitting.clips.contacts import amplitude, detect_stances, runs
+from fitting.clips.formats.bvh import read_bvh
+from fitting.clips.joint_maps import (
+    Trunk,
+    find_roles,
+    find_trunk,
+    partners,
+    read_joint_map,
+    template,
+)
+from fitting.clips.load import ClipOptions, draft_joint_map
+from fitting.clips.rigs import LegMotion
+from fitting.clips.summary import as_json, as_text, describe
+from fitting.motion.flat_animation import load_flat_animation
 from jaxik.world.skeleton import Transform, forward_kinematics
 from support.sample_clips import BVH, flat_floor, stair_walk
 

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips import Clip, formats, load_clip, save_clip
-from fitting.datasets.clips.edit import mask_pops
-from fitting.datasets.clips.formats.asfamc import read_asfamc
-from fitting.datasets.clips.formats.bvh import read_bvh
-from fitting.datasets.clips.guesses import units
-from fitting.datasets.clips.recording import INCH, Y_UP_FROM_Z_UP, Recording
-from fitting.datasets.synthetic import multi_limb, speed_profile, walker
+from fitting.clips import Clip, formats, guesses, load_clip, save_clip
+from fitting.clips.clip import INCH, Y_UP_FROM_Z_UP, Recording
+from fitting.clips.edit import mask_pops
+from fitting.clips.formats.asfamc import read_asfamc
+from fitting.clips.formats.bvh import read_bvh
+from fitting.synthetic import multi_limb, walker
 from support.sample_clips import AMC, AMC_FILES, ASF, BVH, BVH_FILES, stair_walk
 
 # The table of formats
@@ -293,14 +292,14 @@ def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
     ],
 )  # fmt: skip
 def test_a_guessed_unit_says_how_sure_it_is_and_what_else_it_may_be(leg, scale, remark):
-    guessed, text = units.guess(leg)
+    guessed, text = guesses.guess(leg)
     assert guessed == scale and re.search(f"legs of {leg:g} units, taken as .*{remark}", text)
 
 
 def test_a_stated_unit_is_doubted_where_it_makes_no_person():
-    assert [units.doubt(leg, 1.0) for leg in (0.4, 0.84, 1.1)] == ["", "", ""]
+    assert [guesses.doubt(leg, 1.0) for leg in (0.4, 0.84, 1.1)] == ["", "", ""]
     for leg, remedy in ((84.0, "0.01, for centimetres, makes them 0.840 m"), (1.25, "0.672 makes")):
-        text = units.doubt(leg, 1.0)
+        text = guesses.doubt(leg, 1.0)
         assert text.startswith(f"the legs are {leg:g} m long by the scale that the file states; do")
         assert f"give --scale (scale=... in Python) if you know better: {remedy}" in text
 
@@ -424,7 +423,7 @@ def assert_same(clip, expected):
 def test_a_clip_is_loaded_as_it_was_saved_or_not_saved_at_all(walk, path, monkeypatch):
     bare = replace(walk, measured_rig=None, stance=None, mask=None, dialect=None, remarks=())
     climber = multi_limb.climb(0.5)  # on four limbs
-    sliding = walker.walk(3.0, 10.0, events=[speed_profile.Slide(0.5, 2.5)])
+    sliding = walker.walk(3.0, 10.0, events=[walker.Slide(0.5, 2.5)])
     for clip in (walk, bare, climber, sliding):
         save_clip(path, clip)
         assert_same(load_clip(path), clip)

@@ -10,13 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import Clip, contacts
-from fitting.datasets.cut_off_swings import with_cut_off_swings
-from fitting.datasets.ground_path import place_root
-from fitting.datasets.synthetic import gait, speed_profile, walker
-from fitting.report import placement_report
-from fitting.studies.animations import Animation
+from fitting.clips import Clip, clip_frames, contacts
+from fitting.ground.ground_path import place_root
+from fitting.motion.flat_animation import with_cut_off_swings
+from fitting.studies.animations import placement_report
+from fitting.studies.animations.animations import Animation
+from fitting.synthetic import footsteps, walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.grounds import edges_between_footfalls, flight, terrain_of
@@ -26,7 +25,7 @@ FPS = 60.0
 
 @pytest.fixture(scope="module")
 def clip():
-    return walker.walk(2.0, FPS, events=[speed_profile.Slide(1.0, 1.5)])
+    return walker.walk(2.0, FPS, events=[walker.Slide(1.0, 1.5)])
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +52,11 @@ def test_frames_hold_the_clip_in_model_space_above_the_floor(clip):
     found = placed(frames.world_from_model, frames.pose)
     np.testing.assert_allclose(found, joints, rtol=0, atol=1e-9)
     pose = frames.pose
-    assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(gait.ANKLE_HEIGHT + 0.1)
+    assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(footsteps.ANKLE_HEIGHT + 0.1)
     assert frames.weight.shape == (clip.frame_count, 2)
     np.testing.assert_allclose(frames.dt, 1 / FPS)
     np.testing.assert_array_equal(frames.slide, clip.slide)
-    np.testing.assert_allclose(frames.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
+    np.testing.assert_allclose(frames.speed, footsteps.STRIDE / footsteps.PERIOD, rtol=0.02)
     steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
     np.testing.assert_allclose(frames.toe_speed[1:], steps, rtol=1e-9)
     alone = dataclasses.replace(clip, slide=None).select(slice(0, 1))

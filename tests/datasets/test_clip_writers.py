@@ -21,12 +21,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips import Clip, load_clip, save_clip
-from fitting.datasets.clips.edit import mirror, resample
-from fitting.datasets.clips.formats.gltf.bones import bone_mesh
-from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.datasets.terrain.meshes import Mesh, mesh_of
+from fitting.clips import Clip, load_clip, save_clip
+from fitting.clips.clip import local_from_world, world_from_local
+from fitting.clips.edit import mirror, resample
+from fitting.clips.formats.gltf_writer import bone_mesh
+from fitting.ground.meshes import Mesh, load_terrain, mesh_of
 from jaxik.world import terrain
 from support.sample_clips import AMC, ASF, BVH, BVH_FILES, stair_walk
 

@@ -7,11 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fitting.cli import main
-from fitting.datasets.clips import load_clip
-from fitting.datasets.clips.formats.c3d.marker_sets import guess_map
-from fitting.datasets.clips.formats.c3d.markers import read_markers
-from fitting.datasets.clips.formats.c3d.plug_in_gait import chord, hip_centres
-from fitting.datasets.clips.summary import as_text, describe
+from fitting.clips import load_clip
+from fitting.clips.formats.c3d import chord, guess_map, hip_centres
+from fitting.clips.formats.c3d_file import read_markers
+from fitting.clips.summary import as_text, describe
 from support.c3d_files import DEC, INTEL, MEASURES, MIPS, plug_in_gait, write_bytes, write_c3d
 from support.experiments import ROOT
 from support.sample_clips import flat_floor, stair_walk

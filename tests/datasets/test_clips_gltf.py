@@ -11,8 +11,8 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from fitting.datasets.clips import load_clip
-from fitting.datasets.clips.formats.gltf.reader import read_gltf
+from fitting.clips import load_clip
+from fitting.clips.formats.gltf import read_gltf
 from support.gltf_files import Gltf, walker
 
 RAMP = np.array([0.0, 0.1, 0.2, 0.3, 0.4])

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets import coverage, flat_animation, ground_path
-from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips import Clip, edit, load_clip, save_clip
-from fitting.datasets.clips.contacts import runs
-from fitting.datasets.clips.summary import as_text, describe
-from fitting.datasets.coverage import GroundWarning
-from fitting.datasets.flat_animation import flatten_clip, load_flat_animation, with_rigid_legs
-from fitting.datasets.synthetic import gait, walker
-from fitting.datasets.terrain.mesh_files import AS_IS, TerrainOptions, load_terrain, save_mesh
-from fitting.experiments import experiment_files, problems
-from fitting.studies.animations import AnimationFiles, load_animation
+from fitting.clips import Clip, edit, load_clip, save_clip
+from fitting.clips.clip_frames import raised
+from fitting.clips.contacts import runs
+from fitting.clips.summary import as_text, describe
+from fitting.experiment import experiment_files, problems
+from fitting.ground import coverage, ground_path
+from fitting.ground.coverage import GroundWarning
+from fitting.ground.meshes import AS_IS, TerrainOptions, load_terrain, save_mesh
+from fitting.motion import flat_animation
+from fitting.motion.flat_animation import flatten_clip, load_flat_animation, with_rigid_legs
+from fitting.studies.animations.animations import AnimationFiles, load_animation
+from fitting.synthetic import footsteps, walker
 from jaxik.world import terrain
 from support import bodies, experiments
 from support.grounds import edges_between_footfalls, flight, hill, terrain_of
@@ -103,7 +104,7 @@ def test_smoothing_keeps_a_ramp_and_spreads_a_step_over_a_window_ahead_and_back(
     hann = np.hanning(61)
     np.testing.assert_allclose(np.diff(smoothed).max(), 0.15 * hann.max() / hann.sum(), rtol=1e-9)
     # The window is a stride, from touchdown to touchdown.
-    assert ground_path.stride_seconds(clip) == pytest.approx(gait.PERIOD, rel=0.03)
+    assert ground_path.stride_seconds(clip) == pytest.approx(footsteps.PERIOD, rel=0.03)
     standing = replace(clip, stance=np.ones((clip.frame_count, 2), bool))
     assert ground_path.stride_seconds(standing) == ground_path.USUAL_STRIDE
 
@@ -357,7 +358,7 @@ def test_only_observed_frames_are_counted_as_standing_and_measured(tmp_path):
     assert f"of the {121 - first} observed frames" in as_text(described)
     assert flat_animation.stance_difference(late) < 0.01
     over_sole = edit.on_floor(late, -0.01).rig.ankle_height
-    np.testing.assert_allclose(over_sole, gait.ANKLE_HEIGHT + 0.01, atol=1e-3)
+    np.testing.assert_allclose(over_sole, footsteps.ANKLE_HEIGHT + 0.01, atol=1e-3)
     start = late.joints_ws(3)[0, :, 2].max() + 0.1  # beyond which there is ground
     behind = terrain.heightfield(np.zeros((2, 2)), 20.0, (-10.0, 0.0, start))
     share = coverage.measure(late.select(late.observed), behind).share

@@ -9,19 +9,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import Clip, contacts
-from fitting.datasets.clips.kinematics import local_from_world
-from fitting.datasets.synthetic import actions, gait, multi_limb, speed_profile, walker
-from fitting.datasets.synthetic.terrain_meshes import WALL_FROM_FLOOR, WALL_UP, wall
-from fitting.datasets.terrain import mesh_files
+from fitting.clips import Clip, clip_frames, contacts
+from fitting.clips.clip import local_from_world
+from fitting.ground import meshes
+from fitting.synthetic import actions, footsteps, multi_limb, walker
+from fitting.synthetic.terrain_meshes import WALL_FROM_FLOOR, WALL_UP, wall
 
 FPS = 60.0
 EXACT = 1e-9  # m
 STRAIGHT = walker.WalkStyle(bend=0.0)
-SPEED = gait.STRIDE / gait.PERIOD
+SPEED = footsteps.STRIDE / footsteps.PERIOD
 BODIES = {"quadruped": multi_limb.QUADRUPED, "climber": multi_limb.CLIMBER}
-STOPS = [speed_profile.Stop(1.6, 3.7), speed_profile.Stop(5.0, 7.2)]
+STOPS = [walker.Stop(1.6, 3.7), walker.Stop(5.0, 7.2)]
 WALKS = {
     **{f"walk {seed}": partial(walker.walk, 12.0, FPS, seed) for seed in range(3)},
     "stopping": partial(walker.walk, 9.0, FPS, 4, events=STOPS),
@@ -59,13 +58,13 @@ def heel(clip, leg: int) -> np.ndarray:
     """The rear end of a sole, m."""
     ankle = clip.rig.joints[leg][2]
     rot = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True)
-    return clip.positions_ws[:, ankle] + rot.apply([0, -gait.ANKLE_HEIGHT, -gait.HEEL])
+    return clip.positions_ws[:, ankle] + rot.apply([0, -footsteps.ANKLE_HEIGHT, -footsteps.HEEL])
 
 
 @pytest.mark.parametrize("name", CLIPS)
 def test_standing_feet_do_not_move_on_the_ground_and_others_stay_above_it(name):
     clip, height = clip_of(name), places(name)[..., 1]
-    ball_height, ankle_height = gait.BALL_HEIGHT, gait.ANKLE_HEIGHT  # of a flat foot
+    ball_height, ankle_height = footsteps.BALL_HEIGHT, footsteps.ANKLE_HEIGHT  # of a flat foot
     if name in BODIES:
         ball_height = BODIES[name].ball_height
         ankle_height = ball_height + BODIES[name].ankle_to_ball[0]
@@ -93,7 +92,7 @@ def test_standing_feet_do_not_move_on_the_ground_and_others_stay_above_it(name):
 @pytest.mark.parametrize("name", CLIPS)
 def test_limbs_have_their_names_sides_bones_flat_feet_and_flexing_hinges(name):
     clip = clip_of(name)
-    names, lengths = ["left", "right"], [(gait.THIGH, gait.SHIN, gait.FOOT)] * 2
+    names, lengths = ["left", "right"], [(footsteps.THIGH, footsteps.SHIN, footsteps.FOOT)] * 2
     if name in BODIES:
         limbs, foot = BODIES[name].limbs, float(np.hypot(*BODIES[name].ankle_to_ball))
         names, lengths = [limb.name for limb in limbs], [(*limb.bones, foot) for limb in limbs]
@@ -125,7 +124,7 @@ def test_motion_is_smooth_where_a_foot_lifts_off_and_lands(name):
 
 
 def test_impossible_motion_is_refused():
-    slip, slide, stop = speed_profile.Slip, speed_profile.Slide, speed_profile.Stop
+    slip, slide, stop = walker.Slip, walker.Slide, walker.Stop
     four_legged, long_legged = multi_limb.QUADRUPED, replace(multi_limb.QUADRUPED, stride=3.0)
     for make, message in (
         (partial(walker.walk, 0.0), "above 0, got 0.0 s"),
@@ -154,7 +153,7 @@ def test_a_foot_rolls_over_its_heel_lies_flat_and_rises_about_its_ball():
     for seed in range(3):
         clip = clip_of(f"walk {seed}")
         for leg in range(2):
-            height, rear = clip.joints_ws(2)[:, leg, 1] - gait.ANKLE_HEIGHT, heel(clip, leg)
+            height, rear = clip.joints_ws(2)[:, leg, 1] - footsteps.ANKLE_HEIGHT, heel(clip, leg)
             for first, last in stances(clip, leg)[1:]:
                 assert np.ptp(rear[first - 6 : first + 1], axis=0).max() < EXACT
                 assert np.abs(height[first : first + 16]).max() < EXACT and height[last] > 0.03
@@ -164,32 +163,32 @@ def test_stride_cadence_and_pelvis_height_are_those_of_the_measured_walk():
     clip = walker.walk(12.6, FPS, style=walker.WalkStyle(bend=0.0, variation=0.0))
     pelvis = clip.positions_ws[:, 0]
     np.testing.assert_allclose(np.diff(pelvis[:, 2]), SPEED / FPS, rtol=0, atol=EXACT)
-    again = round(gait.PERIOD * FPS)
+    again = round(footsteps.PERIOD * FPS)
     one, next_one = (clip.positions_ws[n * again : (n + 1) * again] for n in (1, 2))
-    np.testing.assert_allclose(one + [0.0, 0.0, gait.STRIDE], next_one, rtol=0, atol=EXACT)
-    assert abs(pelvis[:, 1].mean() - gait.HEIGHT[0]) < 0.03
+    np.testing.assert_allclose(one + [0.0, 0.0, footsteps.STRIDE], next_one, rtol=0, atol=EXACT)
+    assert abs(pelvis[:, 1].mean() - footsteps.HEIGHT[0]) < 0.03
     assert 0.2 < clip.positions_ws[:, clip.rig.joints[0][2], 1].max() < 0.3
 
 
 def test_a_slip_moves_standing_feet_and_a_slide_freezes_the_walk_on_both_at_its_speed():
     change, start, end = 0.06, 2.0, 5.0
-    slip = speed_profile.Slip(start, end, change)
+    slip = walker.Slip(start, end, change)
     slipping, still = (
         walker.walk(8.0, FPS, events=events, style=STRAIGHT) for events in ([slip], [])
     )
     moved = slipping.positions_ws - still.positions_ws
     np.testing.assert_allclose(moved, moved[:, :1] * np.ones((1, 9, 1)), rtol=0, atol=EXACT)
     assert np.abs(moved[: round(start * FPS)]).max() < EXACT
-    full = (end - start - speed_profile.EASE) * change * SPEED
+    full = (end - start - walker.EASE) * change * SPEED
     assert moved[-1, 0, 2] == pytest.approx(full, rel=0.01)
-    clip = walker.walk(8.0, FPS, events=[speed_profile.Slide(3.0, 5.0)])
+    clip = walker.walk(8.0, FPS, events=[walker.Slide(3.0, 5.0)])
     assert clip.slide is not None
     np.testing.assert_array_equal(np.flatnonzero(clip.slide), np.arange(180, 300))
     frozen = slice(round(4.5 * FPS), round(4.85 * FPS))
     about = clip.positions_ws[frozen] - clip.positions_ws[frozen, :1]
     assert np.ptp(about, axis=0).max() < 1e-6
     for _, _, ankle, _ in clip.rig.joints:
-        assert clip.positions_ws[frozen, ankle, 1].max() < gait.ANKLE_HEIGHT + 0.04
+        assert clip.positions_ws[frozen, ankle, 1].max() < footsteps.ANKLE_HEIGHT + 0.04
     travel = np.linalg.norm(np.diff(clip.positions_ws[:, 0, [0, 2]], axis=0), axis=-1) * FPS
     np.testing.assert_allclose(travel, SPEED, rtol=0.01)
     trimmed = clip.select(slice(0, 200)).slide
@@ -209,7 +208,7 @@ def test_in_a_stop_the_walk_breathes_on_two_flat_feet_and_its_front_foot_stays_f
         still = slice(first + 3, last - 2)
         assert stance[still].all()
         assert all(len(contacts.runs(stance[first:last, leg])) == 1 for leg in (0, 1))
-        for role, height in ((2, gait.ANKLE_HEIGHT), (3, gait.BALL_HEIGHT)):
+        for role, height in ((2, footsteps.ANKLE_HEIGHT), (3, footsteps.BALL_HEIGHT)):
             positions = clip.joints_ws(role)[still]
             assert np.ptp(positions, axis=0).max() < 1e-6
             np.testing.assert_allclose(positions[..., 1], height, rtol=0, atol=1e-6)
@@ -217,7 +216,7 @@ def test_in_a_stop_the_walk_breathes_on_two_flat_feet_and_its_front_foot_stays_f
         ahead = int(np.argmax(clip.joints_ws(3)[resumed.start, :, 2]))
         assert stance[resumed, ahead].all()
         ankle = clip.joints_ws(2)[resumed, ahead, 1]
-        np.testing.assert_allclose(ankle, gait.ANKLE_HEIGHT, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(ankle, footsteps.ANKLE_HEIGHT, rtol=0, atol=1e-6)
         breath = np.ptp(clip.positions_ws[first : last + 1, 0], axis=0)
         assert breath[0] == breath[2] == 0.0 and 0.0005 < breath[1] < 0.004
     np.testing.assert_allclose(speed[-30:], SPEED, rtol=0.02)
@@ -321,8 +320,8 @@ def test_on_a_wall_the_root_lies_on_it_and_foot_ik_moves_four_limbs_over_it(tmp_
         np.testing.assert_allclose(rot.apply(axis), np.tile(expected, (30, 1)), atol=1e-12)
     speed = multi_limb.CLIMBER.stride / multi_limb.CLIMBER.period
     np.testing.assert_allclose(frames.speed, speed, rtol=1e-9)
-    mesh_files.save_mesh(tmp_path / "ground.ply", *wall())
-    ground = mesh_files.load_terrain(tmp_path / "ground.ply", up=WALL_UP)
+    meshes.save_mesh(tmp_path / "ground.ply", *wall())
+    ground = meshes.load_terrain(tmp_path / "ground.ply", up=WALL_UP)
     result = jaxik.run(jaxik.presets.record(), clip.rig, ground, frames)
     assert np.asarray(result.trace.sensed.ground.ankle.found).min() == 1.0
     assert np.asarray(result.reached).mean() > 0.95

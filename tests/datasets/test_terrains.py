@@ -15,17 +15,16 @@ from PIL import Image
 from scipy.interpolate import RBFInterpolator
 from trimesh.exchange.gltf import export_gltf
 
+from fitting import clips
 from fitting.cli import main
-from fitting.datasets import clips
-from fitting.datasets.clips import contacts, edit
-from fitting.datasets.ground_path import RAYS, heights_under
-from fitting.datasets.synthetic import gait
-from fitting.datasets.terrain import block_grids, reconstruction, surfaces
-from fitting.datasets.terrain.block_grids import Footprints, Grid
-from fitting.datasets.terrain.mesh_files import height_function, load_terrain, save_mesh
-from fitting.datasets.terrain.reconstruction import Prediction
-from fitting.report import terrain_report
-from fitting.report.plots import style, terrain_plots
+from fitting.clips import contacts, edit
+from fitting.ground import reconstruction
+from fitting.ground.ground_path import RAYS, heights_under
+from fitting.ground.meshes import height_function, load_terrain, save_mesh
+from fitting.ground.reconstruction import Footprints, Grid, Prediction
+from fitting.report import style
+from fitting.studies import terrain_report
+from fitting.synthetic import footsteps
 from jaxik.world import terrain
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh
@@ -312,9 +311,9 @@ def test_a_written_mesh_far_from_the_origin_keeps_a_tenth_of_a_millimetre(tmp_pa
 @pytest.fixture
 def coarse_search(monkeypatch):
     """Searches for grids in large steps, for tests that do not need the grid."""
-    monkeypatch.setattr(block_grids, "PITCH_STEP", 0.15)
-    monkeypatch.setattr(block_grids, "HEADING_STEP", np.radians(15.0))
-    monkeypatch.setattr(block_grids, "LATTICE", (-1, 0, 1))
+    monkeypatch.setattr(reconstruction, "PITCH_STEP", 0.15)
+    monkeypatch.setattr(reconstruction, "HEADING_STEP", np.radians(15.0))
+    monkeypatch.setattr(reconstruction, "LATTICE", (-1, 0, 1))
 
 
 def slope(points: np.ndarray) -> np.ndarray:
@@ -414,23 +413,23 @@ def test_cells_lie_between_their_corners_and_quarter_turns_have_one_canonical_fo
     points = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     for quarters in (-2, -1, 0, 1, 2, 3):
         heading = TILTED.heading + quarters * np.pi / 2
-        (corner,) = corners[:1] @ block_grids._uv_from_xz(heading).T
-        grid = block_grids._canonical(TILTED.pitch, heading, corner)
+        (corner,) = corners[:1] @ reconstruction._uv_from_xz(heading).T
+        grid = reconstruction._canonical(TILTED.pitch, heading, corner)
         assert grid.heading == pytest.approx(TILTED.heading)
         np.testing.assert_allclose(grid.origin, TILTED.origin, atol=1e-9)
         np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
 
 
 def test_an_unknown_grid_is_found(monkeypatch):
-    monkeypatch.setattr(block_grids, "PITCHES", (0.35, 1.0))
-    monkeypatch.setattr(block_grids, "COARSE_KEPT", 8)
+    monkeypatch.setattr(reconstruction, "PITCHES", (0.35, 1.0))
+    monkeypatch.setattr(reconstruction, "COARSE_KEPT", 8)
     angle = np.radians(-13.0)
-    feet, rot = block_footprints(TILTED), block_grids._uv_from_xz(angle).T
+    feet, rot = block_footprints(TILTED), reconstruction._uv_from_xz(angle).T
     heights, heading = block_heights(TILTED, feet.balls) + 1.0, TILTED.heading - angle
     balls, ankles = (points @ rot + [4.0, -7.0] for points in (feet.balls, feet.ankles))
     feet = Footprints(balls, feet.heights + 1.0, ankles)
-    ranked = block_grids.search(feet)
-    surface = surfaces.fit_blocks(ranked, feet)
+    ranked = reconstruction.search(feet)
+    surface = reconstruction.fit_blocks(ranked, feet)
     assert surface.grid.pitch == pytest.approx(TILTED.pitch, rel=0.02)
     assert surface.grid.heading == pytest.approx(heading, abs=np.radians(2.0))
     assert ranked.pitches[0] <= TILTED.pitch <= ranked.pitches[1]
@@ -443,7 +442,7 @@ def test_an_unknown_grid_is_found(monkeypatch):
 def test_a_block_without_footprints_has_the_mean_height_of_its_neighbours():
     square = Grid(1.0, 0.0, (0.0, 0.0))
     cells, tops = np.array([[0, 0], [1, 0], [4, 0]]), np.array([0.1, 0.3, 0.5])
-    surface = surfaces.LevelBlocks(square, cells, tops, np.array([1, 2, 1]))
+    surface = reconstruction.LevelBlocks(square, cells, tops, np.array([1, 2, 1]))
     points = np.array([[0.5, 0.5], [0.5, 1.5], [2.5, 0.5], [3.5, 0.5], [9.5, 0.5]])
     np.testing.assert_allclose(surface.heights(points), [0.1, 0.2, 0.3, 0.5, 0.5])
     np.testing.assert_array_equal(surface.supported(points), [True, False, False, False, False])
@@ -453,17 +452,17 @@ def test_a_plane_is_robust_to_an_outlier_and_level_across_a_line_of_feet():
     feet = hill_footprints()
     heights = 0.2 + feet.balls @ [0.1, -0.05]
     heights[3] += 0.4
-    surface = surfaces.fit_plane(replace(feet, heights=heights))
+    surface = reconstruction.fit_plane(replace(feet, heights=heights))
     assert surface.slope == pytest.approx((0.1, -0.05), abs=1e-3)
     assert surface.level == pytest.approx(0.2, abs=2e-3)
     balls = np.stack([np.zeros(8), np.linspace(0.0, 5.0, 8)], axis=-1)
-    surface = surfaces.fit_plane(Footprints(balls, 0.1 * balls[:, 1], balls))
+    surface = reconstruction.fit_plane(Footprints(balls, 0.1 * balls[:, 1], balls))
     assert surface.slope == pytest.approx((0.0, 0.1), abs=1e-4)
 
 
 def test_a_plate_leaves_one_out_and_is_smoother_over_noisier_heights():
     feet = hill_footprints(12)
-    errors = surfaces._leave_one_out_error(feet.balls, feet.heights)
+    errors = reconstruction._leave_one_out_error(feet.balls, feet.heights)
     for smoothing in (1e-6, 0.01, 1.0):
         predicted = [
             RBFInterpolator(others.balls, others.heights, smoothing=smoothing)(feet.balls[[i]])[0]
@@ -473,31 +472,38 @@ def test_a_plate_leaves_one_out_and_is_smoother_over_noisier_heights():
         assert errors(smoothing) == pytest.approx(expected, rel=1e-6)
     feet = hill_footprints(60)
     noisy = replace(feet, heights=np.random.default_rng(2).normal(0.0, 0.01, 60))
-    assert surfaces.fit_thin_plate(feet).smoothing < 0.01 < surfaces.fit_thin_plate(noisy).smoothing
+    assert (
+        reconstruction.fit_thin_plate(feet).smoothing
+        < 0.01
+        < reconstruction.fit_thin_plate(noisy).smoothing
+    )
     with pytest.raises(ValueError, match="all stances are in a line"):
-        surfaces.fit_thin_plate(Footprints(feet.balls * [1.0, 0.0], feet.heights, feet.balls))
+        reconstruction.fit_thin_plate(Footprints(feet.balls * [1.0, 0.0], feet.heights, feet.balls))
 
 
-def tilted_blocks() -> surfaces.LevelBlocks:
-    ranked = block_grids.RankedGrids((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4))
-    return surfaces.fit_blocks(ranked, block_footprints(TILTED))
+def tilted_blocks() -> reconstruction.LevelBlocks:
+    ranked = reconstruction.RankedGrids((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4))
+    return reconstruction.fit_blocks(ranked, block_footprints(TILTED))
 
 
 def test_a_mesh_has_the_heights_of_its_surface_and_a_bounded_number_of_cells(tmp_path):
-    plane, plate = surfaces.fit_plane(hill_footprints()), surfaces.fit_thin_plate(hill_footprints())
+    plane, plate = (
+        reconstruction.fit_plane(hill_footprints()),
+        reconstruction.fit_thin_plate(hill_footprints()),
+    )
     low, high = np.array([-2.0, -1.5]), np.array([2.0, 2.5])
     for surface, suffix in ((plane, "ply"), (plate, "obj"), (tilted_blocks(), "stl")):
         path, mesh = tmp_path / f"ground.{suffix}", surface.mesh(low, high)
         save_mesh(path, mesh.vertices, mesh.faces)
         points = np.random.default_rng(3).uniform(low, high, (500, 2))
-        if isinstance(surface, surfaces.LevelBlocks):
+        if isinstance(surface, reconstruction.LevelBlocks):
             inner = np.abs(np.mod(surface.grid.coordinates(points), 1.0) - 0.5).max(axis=1) < 0.49
             points = points[inner]
         found = heights_under(load_terrain(path), np.insert(points, 1, 0.0, axis=1), 9.0)
         tolerance = 0.005 if surface is plate else 1e-4
         np.testing.assert_allclose(found, surface.heights(points), atol=tolerance)
     # Too many cells are refused with their number.
-    for surface in (tilted_blocks(), surfaces.fit_thin_plate(hill_footprints())):
+    for surface in (tilted_blocks(), reconstruction.fit_thin_plate(hill_footprints())):
         surface.mesh(np.zeros(2), np.full(2, 9.0))
         for size in (1e3, 1e6):
             with pytest.raises(ValueError, match="[0-9]{7,} cells; wanted at most 2000000"):
@@ -537,12 +543,14 @@ def test_the_simplest_kind_that_is_not_clearly_worse_is_chosen():
 def test_a_stance_is_predicted_from_the_others_only():
     feet = hill_footprints()
     with_outlier = replace(feet, heights=np.where(np.arange(30) == 7, 1.0, 0.0))
-    prediction = reconstruction.leave_one_out(surfaces.fit_plane, with_outlier)
+    prediction = reconstruction.leave_one_out(reconstruction.fit_plane, with_outlier)
     assert prediction.errors[7] == pytest.approx(-1.0, abs=1e-6) and not prediction.alone.any()
-    grid = block_grids.RankedGrids(
+    grid = reconstruction.RankedGrids(
         (Grid(1e-3, 0.0, (0.0, 0.0)),), np.zeros(1), (0.0, 1.0), (0.0, 1.0)
     )
-    unsupported = reconstruction.leave_one_out(lambda feet: surfaces.fit_blocks(grid, feet), feet)
+    unsupported = reconstruction.leave_one_out(
+        lambda feet: reconstruction.fit_blocks(grid, feet), feet
+    )
     assert unsupported.alone.all() and np.isnan(unsupported.rms_shared) and unsupported.rms > 0.0
 
 
@@ -552,7 +560,7 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     walk = stair_walk(slope, strides=6)
     ground = reconstruction.reconstruct(walk, sole=0.0)
     assert ground.chosen == "plane" and ground.predictions["plane"].rms < 0.003
-    assert isinstance(ground.surface, surfaces.Plane)
+    assert isinstance(ground.surface, reconstruction.Plane)
     assert ground.surface.slope == pytest.approx((0.0, -0.1), abs=0.003)
     assert reconstruction.reconstruct(stair_walk(slope), kind="smooth").chosen == "smooth"
     monkeypatch.setattr(reconstruction, "MOST_STANCES", 5)
@@ -564,7 +572,7 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     assert len(ground.predictions["plane"].errors) == 5
     text = terrain_report.count_stances(ground)
     assert text == f"{count} stances; surfaces are fitted to 5 of all, evenly chosen"
-    figure = terrain_plots.plan(ground, 0.5, walk.rig.names, "title")
+    figure = terrain_report.plan(ground, 0.5, walk.rig.names, "title")
     panels = {axes.get_ylabel(): axes.lines for axes in figure.axes}
     drawn = {tuple(np.asarray(line.get_ydata())) for line in panels["error, cm"]}
     assert drawn >= {tuple(100 * each.errors) for each in ground.predictions.values()}
@@ -585,7 +593,7 @@ def test_ground_lies_a_sole_below_the_balls_as_the_rig_has_it_or_as_it_is_given(
 
 def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search):
     walk = clips.load_clip(ROOT / "data" / "clips" / "uneven_walk.npz")
-    ground = reconstruction.reconstruct(walk, sole=gait.BALL_HEIGHT)
+    ground = reconstruction.reconstruct(walk, sole=footsteps.BALL_HEIGHT)
     assert ground.chosen == "smooth"
     true = load_terrain(ROOT / "data" / "terrains" / "uneven_walk.ply")
     points_ws = np.insert(ground.stances.points, 1, 0.0, axis=1)
@@ -609,7 +617,7 @@ def test_the_blocks_of_subject_03_are_reconstructed_within_a_centimetre(mocap):
     clip = clips.load_clip(mocap / "clips" / "cmu_asfamc" / "03_03.amc")
     assert np.allclose(clip.rig.ball_height, sole, atol=0.01)  # as estimated from the feet
     ground = reconstruction.reconstruct(clip, sole=sole)
-    assert ground.chosen == "blocks" and isinstance(ground.surface, surfaces.LevelBlocks)
+    assert ground.chosen == "blocks" and isinstance(ground.surface, reconstruction.LevelBlocks)
     error = ground.surface.heights(known.points(cells + 0.5)) - heights
     assert np.sqrt(np.mean(error**2)) < 0.01
     assert np.sqrt(np.mean(error[clean] ** 2)) < 0.006

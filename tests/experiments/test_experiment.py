@@ -9,22 +9,19 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.datasets.synthetic import walker
-from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
-from fitting.datasets.terrain.meshes import mesh_of
-from fitting.experiments import experiment_files, problems, systems
-from fitting.experiments.ablations import Ablation
-from fitting.experiments.experiment import ClipEntry, Experiment, FitOptions
-from fitting.experiments.in_memory.making import clip_entry, make_experiment
-from fitting.experiments.in_memory.saving import with_files
-from fitting.experiments.in_memory.selectors import free_table
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.sampling.settings import SamplerSettings
-from fitting.problem.digest import digest
-from fitting.problem.prior import ParameterPrior
+from fitting.clips import load_clip, save_clip
+from fitting.clips.clip_frames import raised
+from fitting.experiment import experiment_files, problems, systems
+from fitting.experiment.experiment import ClipEntry, Experiment, FitOptions
+from fitting.experiment.file_tables import Ablation
+from fitting.experiment.in_memory import clip_entry, free_table, make_experiment, with_files
+from fitting.ground.meshes import load_terrain, mesh_of, save_mesh
+from fitting.inference.optimise.solution import SearchSettings
+from fitting.inference.sample.blocks import SamplerSettings
+from fitting.problem.problem import digest
+from fitting.problem.space import ParameterPrior
 from fitting.studies import ablation
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.stages.pelvis import LowestPelvis, ReachPelvis
 from jaxik.world import terrain as terrains

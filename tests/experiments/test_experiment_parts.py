@@ -9,21 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.analysis import playback
 from fitting.cli import main
 from fitting.cli.commands import fits as commands
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.clips import Clip, flight, load_clip, save_clip
-from fitting.experiments import parameter_files, record_only, track_files
-from fitting.experiments.experiment_files import experiment_to_toml, load_experiment
-from fitting.experiments.hierarchies import Hierarchy
-from fitting.experiments.problems import load_clip_data, make_problem
-from fitting.experiments.systems import Preset
-from fitting.jobs import animations, fits
+from fitting.clips import Clip, flight, load_clip, save_clip
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.experiment import parameter_files, record_files, track_files
+from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiment.file_tables import Hierarchy
+from fitting.experiment.problems import load_clip_data, make_problem
+from fitting.experiment.systems import Preset
+from fitting.motion import playback
 from fitting.problem.scene import legs_ws, pelvis_ws
-from fitting.studies import ablation, record_price
-from fitting.studies.animations import AnimationFiles
-from fitting.studies.fit import Fit
+from fitting.studies import ablation
+from fitting.studies.animations import animation_jobs
+from fitting.studies.animations.animations import AnimationFiles
+from fitting.studies.fit import fit_jobs, record_price
+from fitting.studies.fit.fit import Fit
 from jaxik import presets, record
 from jaxik.maths import parameter_tree
 from jaxik.world import body
@@ -154,9 +155,9 @@ def test_a_run_is_applied_to_the_body_of_the_animation(tmp_path, monkeypatch):
     (tmp_path / "fit.json").write_text(json.dumps({"parameters": rows}))
     save_clip(tmp_path / "giant.npz", scaled(load_clip(BASE), 2.0))
     applied = []
-    monkeypatch.setattr(animations, "solve", lambda ik, *_, **__: applied.append(ik))
+    monkeypatch.setattr(animation_jobs, "solve", lambda ik, *_, **__: applied.append(ik))
     files = AnimationFiles(tmp_path / "giant.npz", tmp_path / "unused.ply")
-    animations.apply(tmp_path, files)
+    animation_jobs.apply(tmp_path, files)
     ratio = body.leg_length(files.flat_clip.rig) / 0.84
     height = float(parameter_tree.get(applied[0], "target.foot_height"))
     assert height == pytest.approx(0.1 * ratio) and ratio > 1.9
@@ -312,11 +313,11 @@ def test_what_the_record_has_no_room_for_is_not_free_but_what_its_reader_assumes
     other = "[parameters]\nlock.lock_half_life = 0.02\nprobe.limited = true\nfoot.max_roll = 0.2"
     experiment = restricted(tmp_path, rest=other)
     assert list(experiment.free) == ["foot.max_pitch", "probe.toe_ls[1]"]
-    assert record_only.left_out(experiment) == ["lock.max_speed"]
+    assert record_files.left_out(experiment) == ["lock.max_speed"]
     ik = experiment.starting_system()
     assert record.dropped(ik) == {}
     assert float(parameter_tree.get(ik, "foot.max_roll")) == pytest.approx(0.2)
-    aside = record_only.set_aside(experiment)
+    aside = record_files.set_aside(experiment)
     assert aside["lock.lock_half_life"] == ("0.02 s", "0.05 s") and "probe.limited" in aside
     fitted = []
     monkeypatch.setattr(commands.jobs, "fit", lambda entry, *_, **__: fitted.append(entry))
@@ -338,7 +339,7 @@ def test_a_restricted_experiment_is_the_same_when_read_again_or_refused_if_it_co
     loaded = load_experiment(again)
     for field in ("free", "parameters", "start", "prior"):
         assert getattr(loaded, field) == getattr(experiment, field)
-    assert record_only.left_out(loaded) == []
+    assert record_files.left_out(loaded) == []
     for parts, message in (
         ({"top": "record_only = true"}, "preset = 'record' with faithful = false;"),
         ({"top": 'preset = "ozz"\nrecord_only = true'}, "preset = 'ozz' with faithful = false;"),
@@ -375,7 +376,7 @@ def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkey
     ankle = np.sqrt(np.mean(play.errors["ankle"] ** 2))
     assert price.errors["ankle"][0] == pytest.approx(ankle)
     assert price.errors["ankle"][1] != pytest.approx(ankle)
-    text, section = fits._price_of_record(fitted, None, lines.append)
+    text, section = fit_jobs._price_of_record(fitted, None, lines.append)
     assert lines == ["what the record costs: a search in which target.rise_half_life are free, too"]
     said = "The cost is 3; with these free, too, a search from there ends at 2."
     assert said in "".join(text) and said in section[1]

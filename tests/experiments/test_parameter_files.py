@@ -12,10 +12,9 @@ import pytest
 import fitting
 from fitting import jobs
 from fitting.cli import main
-from fitting.experiments import experiment_files, parameter_files, systems
-from fitting.experiments.originals import conversion, settings_files
-from fitting.experiments.originals.layout import ORIGINALS
-from fitting.experiments.systems import DEFAULT_PRESET, Preset, leaf_names
+from fitting.experiment import experiment_files, originals, parameter_files, systems
+from fitting.experiment.originals import ORIGINALS
+from fitting.experiment.systems import DEFAULT_PRESET, Preset, leaf_names
 from jaxik import FootIK, presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.lean import NoLean
@@ -177,15 +176,15 @@ def system_of(name: str) -> FootIK:
 @pytest.mark.parametrize("name", HANDS)
 def test_settings_written_by_hand_are_these_parameters_and_back(name):
     settings, parameters = HANDS[name]
-    ik = conversion.to_ik(settings, name)
+    ik = originals.to_ik(settings, name)
     for leaf, value in parameters.items():
         assert parameter_tree.get(ik, leaf).tolist() == pytest.approx(value, rel=1e-6), leaf
-    written = conversion.to_settings(system_of(name), name)
+    written = originals.to_settings(system_of(name), name)
     assert settings.keys() == {setting.name for setting in ORIGINALS[name].settings}
     assert written == {key: pytest.approx(value, rel=1e-6) for key, value in settings.items()}
 
 
-@pytest.mark.parametrize("suffix", settings_files.SUFFIXES)
+@pytest.mark.parametrize("suffix", originals.SUFFIXES)
 @pytest.mark.parametrize("name", HANDS)
 def test_a_file_of_settings_comes_back_as_the_same_parameters(name, suffix, tmp_path):
     ours, theirs = tmp_path / "ours.toml", tmp_path / f"theirs{suffix}"
@@ -215,9 +214,9 @@ def test_what_an_original_cannot_hold_is_named_and_left_out_only_if_wanted(tmp_p
     # What changes nothing is not missed.
     unused = {"root.half_life": 0.3, "probe.max_step_up": 0.5}
     ik = parameter_tree.replace(presets.unreal(faithful=True), unused)
-    assert conversion.dropped(ik, ORIGINALS["unreal"]) == {}
+    assert originals.dropped(ik, ORIGINALS["unreal"]) == {}
     ik = parameter_tree.replace(ik, {"root.enabled": True})
-    assert set(conversion.dropped(ik, ORIGINALS["unreal"])) == {"root.enabled", "root.half_life"}
+    assert set(originals.dropped(ik, ORIGINALS["unreal"])) == {"root.enabled", "root.half_life"}
     for name, changed, message in (
         ("unreal", {"probe.ray_up": 0.8}, "m_IKCapsuleHalfHeight is one setting, but pelvis.half_"),
         ("ozz", {"leg.soften": [1.0, 0.9]}, "soften_ is one for all legs"),
@@ -225,7 +224,7 @@ def test_what_an_original_cannot_hold_is_named_and_left_out_only_if_wanted(tmp_p
     ):
         ik = parameter_tree.replace(Preset(name, faithful=True).system(), changed)
         with pytest.raises(ValueError, match=message):
-            conversion.to_settings(ik, name)
+            originals.to_settings(ik, name)
 
 
 def test_a_wrong_table_of_settings_costs_one_sentence(tmp_path):
@@ -248,7 +247,7 @@ def test_a_wrong_table_of_settings_costs_one_sentence(tmp_path):
     for damaged in ("[" * 100_000, '"' + "x" * 200_000):
         path.write_text(f"system,setting,value,unit\nozz,foot_heigh_,{damaged},m\n")
         with pytest.raises(ValueError, match="no table of settings"):
-            settings_files.load_settings(path)
+            originals.load_settings(path)
 
 
 @pytest.mark.filterwarnings("ignore:parameters do not tell the knee's axis")

@@ -13,13 +13,11 @@ from typing import Any
 import jsonschema
 import pytest
 
-from fitting.experiments import ablations, experiment_files, hierarchies, parameter_files, systems
-from fitting.experiments.schema import keys
-from fitting.experiments.schema.experiment_schema import experiment_schema
-from fitting.experiments.schema.tables import named
-from fitting.experiments.tables import prior_tables
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.sampling.settings import SamplerSettings
+from fitting.experiment import experiment_files, file_tables, parameter_files, systems
+from fitting.experiment import schema as schema_module
+from fitting.experiment.schema import experiment_schema, named
+from fitting.inference.optimise.solution import SearchSettings
+from fitting.inference.sample.blocks import SamplerSettings
 from fitting.inference.settings import describe
 from fitting.problem.scene import LEAST_SIGMAS
 from fitting.runtime import validation
@@ -29,16 +27,16 @@ from support.experiments import CLIP, ROOT, text, write
 
 KEYS: dict[str, Mapping[str, Constraint]] = {
     "top": experiment_files.TOP_KEYS,
-    "clips": keys.CLIP_KEYS,
+    "clips": schema_module.CLIP_KEYS,
     "sigmas": experiment_files.SIGMA_KEYS,
     "fit": experiment_files.FIT_KEYS,
     "search": experiment_files.SEARCH_KEYS,
     "sample": experiment_files.SAMPLE_KEYS,
     "noise": experiment_files.NOISE_KEYS,
     "free": systems.FREE_KEYS,
-    "prior": prior_tables.KEYS,
-    "hierarchy": hierarchies.KEYS,
-    "without": ablations.KEYS,
+    "prior": file_tables.PRIOR_KEYS,
+    "hierarchy": file_tables.HIERARCHY_KEYS,
+    "without": file_tables.ABLATION_KEYS,
 }
 NUMBERS = [-1, -0.1, 0, 1e-12, 1e-9, 1e-3, 0.01, 0.5, 0.999, 1, 1.5, 2, 3, 1000, 1000.5, 1e6, 1e12]
 NUMBERS += [2**32 - 1, 2**32, 1e39, -1e39, math.inf, -math.inf]
@@ -371,7 +369,7 @@ def test_every_number_of_the_format_has_a_range_here():
     assert SAMPLE.keys() == describe(SamplerSettings).keys()
     assert {**SIGMAS, **CORRELATIONS}.keys() == experiment_files.SIGMA_KEYS.keys()
     of_clips = {*OF_CLIPS, "scale"}  # which no .npz has
-    for numbers, table in ((TOP, experiment_files.TOP_KEYS), (of_clips, keys.CLIP_KEYS)):
+    for numbers, table in ((TOP, experiment_files.TOP_KEYS), (of_clips, schema_module.CLIP_KEYS)):
         types = {key: constraint.schema.get("type") for key, constraint in table.items()}
         assert {*numbers} == {key for key in types if types[key] in ("number", "integer")}
     for settings in (SearchSettings, SamplerSettings):

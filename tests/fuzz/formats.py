@@ -14,17 +14,17 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.edit import mask_pops
-from fitting.datasets.clips.joints.map_files import template
-from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments import parameter_files, record_files, track_files
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.known_values import load_known_values
-from fitting.experiments.originals import conversion, settings_files
+from fitting.clips import load_clip, save_clip
+from fitting.clips.clip import Clip
+from fitting.clips.edit import mask_pops
+from fitting.clips.joint_maps import template
+from fitting.experiment import originals, parameter_files, record_files, track_files
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import load_known_values
+from fitting.ground.meshes import load_terrain
 from fitting.runtime.validation import error_context
-from fitting.studies import run_folder, translation
+from fitting.studies import translation
+from fitting.studies.fit import run_folder
 from jaxik import presets, record
 from support import experiments
 from support.c3d_files import MEASURES, plug_in_gait, write_c3d
@@ -107,7 +107,7 @@ def load_system(path: Path) -> None:
 
 
 def load_settings(path: Path) -> None:
-    soundness.check_system(settings_files.load_settings(path)[0])
+    soundness.check_system(originals.load_settings(path)[0])
 
 
 def load_truth(path: Path) -> None:
@@ -116,8 +116,8 @@ def load_truth(path: Path) -> None:
 
 
 def settings_of_mec(suffix: str = ".toml") -> bytes:
-    values = conversion.to_settings(presets.mec(faithful=True), "mec")
-    return settings_files.settings_text(values, "mec", suffix).encode()
+    values = originals.to_settings(presets.mec(faithful=True), "mec")
+    return originals.settings_text(values, "mec", suffix).encode()
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,19 @@ from typing import NoReturn
 
 import numpy as np
 
-from fitting.analysis.accuracy import Accuracy
-from fitting.analysis.goodness.distances import CLOSE, MOTIONS, PARTS
-from fitting.inference.optimisation import search
-from fitting.inference.optimisation.kept_stages import KeptStages
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.solution import Solution
-from fitting.inference.optimisation.state import Search, SearchState
-from fitting.inference.profiles.state import Profiling
+from fitting.inference.optimise import search
+from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.solution import Search, SearchSettings, SearchState, Solution
+from fitting.inference.profiles.profiling import Profiling
+from fitting.motion.accuracy import Accuracy
+from fitting.motion.goodness import CLOSE, MOTIONS, PARTS
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
-from fitting.studies.calibration import calibration
-from fitting.studies.calibration.replicates import DRAWS, LEVELS
-from fitting.studies.hierarchy import kept_searches
+from fitting.studies.calibrate import calibration
+from fitting.studies.calibrate.replicates import DRAWS, LEVELS
+from fitting.studies.population import kept_searches
 from support.curves import curve_problem
 
 SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 import jaxik
-from fitting.datasets.clips.clip import Clip
-from fitting.experiments.experiment import Experiment
+from fitting.clips.clip import Clip
+from fitting.experiment.experiment import Experiment
 from jaxik.maths import parameter_tree
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh

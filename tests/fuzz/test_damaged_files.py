@@ -20,9 +20,9 @@ import trimesh
 from trimesh.exchange.gltf import export_gltf
 
 from fitting.cli import main
-from fitting.datasets import archives
-from fitting.datasets.clips import load_clip
-from fitting.datasets.terrain.mesh_files import load_terrain
+from fitting.clips import load_clip
+from fitting.clips.formats import npz
+from fitting.ground.meshes import load_terrain
 from fuzz.damage import archive_of, damage_arrays, damage_toml, glb_of, parts_of_glb
 from fuzz.formats import FORMATS, mesh_bytes
 from fuzz.trial import OUTCOMES, run_trials, try_to_load
@@ -258,7 +258,7 @@ def test_an_archive_is_no_mesh_and_is_not_read_where_its_arrays_are_large(tmp_pa
     path.write_bytes(FORMATS["clip, NPZ"].whole())
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bomb.npy", bytes(2**24))
-    monkeypatch.setattr(archives, "MAX_BYTES", 2**24)
+    monkeypatch.setattr(npz, "MAX_BYTES", 2**24)
     assert path.stat().st_size < 2**17
     with pytest.raises(ValueError, match="its arrays take 16[0-9]{6} bytes; wanted 16777216 at"):
         load_clip(path)

@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 
 import house
 from fitting.cli import main
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.datasets.clips.formats.npz import is_blocks_file
-from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments.experiment import ClipEntry
-from fitting.experiments.experiment_files import load_experiment, parse_experiment
-from fitting.report.plots import style
-from fitting.studies.hierarchy.population import clip_names
+from fitting.clips import load_clip, save_clip
+from fitting.clips.formats.npz import is_blocks_file
+from fitting.experiment.experiment import ClipEntry
+from fitting.experiment.experiment_files import load_experiment, parse_experiment
+from fitting.ground.meshes import load_terrain
+from fitting.report import style
+from fitting.studies.population.population import clip_names
 from support import experiments
 from support.sample_clips import BVH
 

@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fitting.inference.calibration.proportions import clopper_pearson, proportion
-from fitting.inference.calibration.rank_bands import RankTest, count_band, cumulative_counts
+from fitting.inference.proportions import (
+    RankTest,
+    clopper_pearson,
+    count_band,
+    cumulative_counts,
+    proportion,
+)
 
 # Shares
 

@@ -11,14 +11,18 @@ import pytest
 from jaxtyping import Array
 from scipy import linalg, stats
 
-from fitting.inference.hierarchy.grouping import Grouping
-from fitting.inference.hierarchy.likelihoods import approximate_prior, expand
-from fitting.inference.hierarchy.mixed_model import MixedModel, SpreadDensity
-from fitting.inference.hierarchy.population_fit import PopulationFit, fit_population
-from fitting.problem.prior import ParameterPrior, Priors
+from fitting.inference.mixed_model import (
+    Grouping,
+    MixedModel,
+    PopulationFit,
+    SpreadDensity,
+    approximate_prior,
+    expand,
+    fit_population,
+)
 from fitting.problem.problem import Problem
-from fitting.problem.space import Space
-from fitting.studies.hierarchy.estimates import summarise
+from fitting.problem.space import ParameterPrior, Priors, Space
+from fitting.studies.population.population import summarise
 from support.problems import parameter, problem_of
 
 # The linear mixed model

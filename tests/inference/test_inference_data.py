@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fitting.inference.sampling import blocks, inference_data
-from fitting.inference.sampling.blocks import BlockLogLikelihood, leave_one_out
-from fitting.inference.sampling.posterior import Posterior
-from fitting.problem.prior import ParameterPrior, Priors
-from fitting.problem.space import Space
+from fitting.inference.sample import blocks, inference_data
+from fitting.inference.sample.blocks import BlockLogLikelihood, leave_one_out
+from fitting.inference.sample.posterior import Posterior
+from fitting.problem.space import ParameterPrior, Priors, Space
 from support import toy
 from support.problems import posterior_of, problem_of
 

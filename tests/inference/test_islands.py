@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fitting.inference.sampling import diagnostics, islands, posterior, sampler
-from fitting.inference.sampling.posterior import Posterior, WalkerStart
-from fitting.inference.sampling.settings import SamplerSettings
+from fitting.inference.sample import diagnostics, modes, posterior, sampler
+from fitting.inference.sample.blocks import SamplerSettings
+from fitting.inference.sample.posterior import Posterior, WalkerStart
 from fitting.problem.problem import Problem
 from support.problems import problem_of_fractions
 
@@ -136,26 +136,26 @@ def test_a_posterior_of_one_piece_has_one_island_and_two_of_different_width_are_
         "ridge": 10 * random.normal(size=(*draws[:2], 1)) + random.normal(size=draws),
         "plateau": random.uniform(size=draws) ** 3,
     }.items():
-        assert len(islands.find_islands(u)) == 1, shape
-        assert islands.survey(u, np.zeros(draws[:2])) == (), shape
+        assert len(modes.find_islands(u)) == 1, shape
+        assert modes.survey(u, np.zeros(draws[:2])) == (), shape
     few = draws[1] // 8
     many = draws[1] - few
     normal[:, :few] = 0.2 * normal[:, :few] + 15.0 * np.eye(size)[0]
-    labels = islands.find_islands(normal).labels(normal)
+    labels = modes.find_islands(normal).labels(normal)
     assert np.sort(np.bincount(labels.ravel())).tolist() == sorted([150 * few, 150 * many])
-    small, large = islands.survey(normal, np.zeros(draws[:2]))[::-1]
+    small, large = modes.survey(normal, np.zeros(draws[:2]))[::-1]
     assert (small.exchanges, small.walkers, large.walkers) == (0, few, many)
 
 
 def test_walkers_that_have_not_met_yet_or_never_move_are_no_islands():
     random = np.random.default_rng(0)
     u = 0.1 * random.normal(size=(100, 24, 6)) + 10.0 * random.normal(size=(24, 6))
-    assert len(islands.find_islands(u)) == 1
-    assert len(islands.find_islands(np.ones((50, 8, 2)))) == 1
+    assert len(modes.find_islands(u)) == 1
+    assert len(modes.find_islands(np.ones((50, 8, 2)))) == 1
 
 
 def test_the_density_of_jumps_is_that_of_their_draws():
-    found = islands.Islands(
+    found = modes.Islands(
         np.array([[0.0, 0.0], [9.0, 1.0]]),
         np.array([[[1.0, 0.0], [0.8, 0.5]], [[0.2, 0.0], [0.0, 2.0]]]),
         np.array([0.7, 0.3]),

@@ -10,12 +10,11 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from fitting.inference.optimisation import descent, evolution, kept_stages, search
-from fitting.inference.optimisation.kept_stages import KeptStages
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.solution import Solution
+from fitting.inference.optimise import checkpoints, descent, evolution, search
+from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.solution import SearchSettings, Solution
 from fitting.inference.profiles import profiling
-from fitting.inference.profiles.curves import Curves
+from fitting.inference.profiles.profile import Curves
 from fitting.problem.problem import Problem
 from support.curves import curve_problem
 
@@ -34,7 +33,7 @@ def problem() -> Problem:
 @pytest.fixture
 def path(tmp_path, monkeypatch) -> Path:
     """Where stages are kept, each at once."""
-    monkeypatch.setattr(kept_stages, "SECONDS_BETWEEN_WRITES", 0.0)
+    monkeypatch.setattr(checkpoints, "SECONDS_BETWEEN_WRITES", 0.0)
     return tmp_path / "search.json"
 
 

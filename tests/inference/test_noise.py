@@ -14,21 +14,19 @@ from scipy import integrate, linalg, optimize, stats
 
 import fitting
 import jaxik
-from fitting.experiments import problems
-from fitting.experiments.experiment import Experiment
-from fitting.experiments.experiment_files import load_experiment
+from fitting.experiment import problems
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.inference import noise
+from fitting.inference import noise as inference_noise
 from fitting.inference.identifiability import assess_identifiability
-from fitting.inference.noise import marginal, model, series
-from fitting.inference.noise.density import NoiseDensity
-from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.problem.loss import CAUCHY, HUBER, Loss, apply_loss
-from fitting.problem.problem import Problem
+from fitting.inference.noise import NoiseDensity, NoiseModel, NoiseOptions, noise_of, with_noise
+from fitting.problem.problem import CAUCHY, HUBER, Loss, Problem, apply_loss
 from fitting.problem.residuals import residuals_by_kind
 from fitting.problem.scene import LEAST_SIGMAS, Scene
 from fitting.problem.simulation import autoregression
-from fitting.studies import assess, run_folder
-from fitting.studies.assess import search_with_noise
+from fitting.studies.fit import assess, run_folder
+from fitting.studies.fit.assess import search_with_noise
 from support.experiments import ROOT
 
 BOTH = NoiseOptions("estimated", "whitened")
@@ -69,7 +67,7 @@ def test_sigma_and_correlation_are_those_of_the_exact_likelihood_unless_one_is_g
     values = 0.3 * autoregression(random.normal(size=(120, 2)), 0.8)
     active = np.ones((120, 2), bool)
     active[40:50] = False
-    errors = series.Errors(np.where(active, values, 0.0), active)
+    errors = noise.Errors(np.where(active, values, 0.0), active)
     runs = [part for column in errors.values.T for part in (column[:40], column[50:])]
 
     def minus_log_likelihood(x: np.ndarray) -> float:
@@ -82,11 +80,11 @@ def test_sigma_and_correlation_are_those_of_the_exact_likelihood_unless_one_is_g
         return total
 
     best = optimize.minimize(minus_log_likelihood, [0.0, 0.0], method="Nelder-Mead").x
-    found = series.likeliest([errors], "squares", 4.0, None)
+    found = noise.likeliest([errors], "squares", 4.0, None)
     assert found.sigma == pytest.approx(math.exp(best[0]), rel=1e-3)
     assert found.correlation == pytest.approx(math.tanh(best[1]), abs=1e-3)
-    given = series.likeliest([errors], "squares", 4.0, 0.5)
-    values = series.innovations(errors, 0.5)
+    given = noise.likeliest([errors], "squares", 4.0, 0.5)
+    values = noise.innovations(errors, 0.5)
     assert given.correlation == 0.5 and values.size == errors.active.sum()
     assert given.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
 
@@ -96,8 +94,8 @@ def test_scale_and_tails_are_those_of_scipys_t():
         values = 0.2 * np.asarray(stats.t.rvs(nu, size=4000, random_state=1))
         tails, sigma = 4.0, 1.0
         for _ in range(60):
-            sigma = series.scale(values, "student", tails)
-            tails = series.likeliest_tails(values / sigma)
+            sigma = noise.scale(values, "student", tails)
+            tails = noise.likeliest_tails(values / sigma)
         expected = stats.t.fit(values, floc=0)
         assert tails == pytest.approx(expected[0], rel=0.01)
         assert sigma == pytest.approx(expected[2], rel=0.01)
@@ -112,8 +110,8 @@ def test_students_slopes_tell_less_than_they_say():
         draws = stats.t.rvs(nu, size=200_000, random_state=2)
         score = (nu + 1) * draws / (nu + draws**2)
         ratio = np.mean(score**2) / np.mean(np.asarray(slopes(jnp.asarray(draws), nu)) ** 2)
-        assert series.information_of_slopes("student", nu) == pytest.approx(ratio, rel=0.01)
-    assert series.information_of_slopes("squares", 2.0) == 1.0
+        assert noise.information_of_slopes("student", nu) == pytest.approx(ratio, rel=0.01)
+    assert noise.information_of_slopes("squares", 2.0) == 1.0
 
 
 # A problem without a pipeline: two parameters shift the errors of each frame
@@ -170,7 +168,7 @@ def walk(options: NoiseOptions, loss: str = "squares") -> tuple[Experiment, Foot
 @pytest.fixture
 def no_pipeline(monkeypatch) -> None:
     """The errors are those of the problem's own residuals."""
-    monkeypatch.setattr(model, "_errors_by_kind", errors_by_kind)
+    monkeypatch.setattr(inference_noise, "_errors_by_kind", errors_by_kind)
     monkeypatch.setattr(assess, "played_errors", lambda problem, u: None)  # as above
 
 
@@ -207,7 +205,7 @@ def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
     def objective(x: np.ndarray) -> float:
         sigmas, rhos = np.exp(x[2:7]), np.tanh(x[7:])
         by_kind, of_prior = errors_and_prior(jnp.asarray(x[:2]))
-        errors = model._counted(correlated.data[0], by_kind)
+        errors = inference_noise._counted(correlated.data[0], by_kind)
         total = 0.5 * float(np.sum(np.asarray(of_prior) ** 2))
         for kind, sigma, rho in zip(KINDS, sigmas, rhos, strict=True):
             values = errors[kind].values
@@ -259,9 +257,9 @@ def test_noise_that_no_capture_has_is_refused(correlated, no_pipeline):
     u = correlated.space.start
     tiny = resized(simulated(resized(correlated, 0.01), u, 0.0, seed=5), 100.0)
     message = 'ankle has collapsed: its likeliest sigma is 2e-05, .*correlation = "counted" in'
-    with pytest.raises(model.NoiseCollapse, match=message):
-        model.likeliest_noise(tiny, u, NoiseOptions("estimated"))
-    whitened = model.likeliest_noise(tiny, u, NoiseOptions(correlation="whitened"))
+    with pytest.raises(inference_noise.NoiseCollapse, match=message):
+        inference_noise.likeliest_noise(tiny, u, NoiseOptions("estimated"))
+    whitened = inference_noise.likeliest_noise(tiny, u, NoiseOptions(correlation="whitened"))
     assert whitened.sigmas == noise_of(tiny).sigmas
 
 
@@ -295,7 +293,7 @@ def test_the_weight_is_the_curvature_over_the_variance_of_the_score(
     influence = INFLUENCES[loss](r)
     expected = density @ np.gradient(influence, r) / (density @ influence**2)
     expected *= (1 - rho) / (1 + rho)
-    counted = model.counted(captured, u)
+    counted = inference_noise.counted(captured, u)
     assert float(counted.weight) == pytest.approx(expected, rel=0.1)
     assert noise_of(counted).sigmas == noise_of(captured).sigmas
     assert noise_of(counted).correlations == noise_of(captured).correlations
@@ -309,7 +307,7 @@ def test_no_residual_counts_as_smaller_than_the_least_sigma(correlated, no_pipel
         kind: (LEAST_SIGMAS[kind] / sigma) ** 2 for kind, sigma in noise_of(exact).sigmas.items()
     }
     expected = sum(counts.values()) / sum(counts[kind] * squares[kind] for kind in KINDS)
-    assert model.likelihood_weight(exact, u) == pytest.approx(expected, rel=0.1)
+    assert inference_noise.likelihood_weight(exact, u) == pytest.approx(expected, rel=0.1)
 
 
 def test_a_weight_does_not_move_the_best_fit(correlated, no_pipeline):
@@ -352,7 +350,9 @@ def test_intervals_contain_the_truth_under_correlated_noise_of_another_size(
         jacobian: Any = functools.partial(at, part=1)
         best = optimize.least_squares(at, truth, jac=jacobian)
         own = dataclasses.replace(scene, tracks={**scene.tracks, "ankle": ankle})
-        weight = model.likelihood_weight(dataclasses.replace(problem, data=(own,)), best.x)
+        weight = inference_noise.likelihood_weight(
+            dataclasses.replace(problem, data=(own,)), best.x
+        )
         rise = 0.5 * float(np.sum(at(truth) ** 2)) - best.cost
         inside.append(weight * rise <= 0.5 * stats.chi2.ppf(0.95, 2))
     assert 0.91 < np.mean(inside) < 0.985
@@ -368,7 +368,7 @@ def only_ankles(problem: FootProblem) -> FootProblem:
 def test_open_sigmas_are_integrated_out(correlated):
     """Against a sum over a grid of log-sigmas, of which one is open."""
     problem = only_ankles(correlated).with_weight(0.5)
-    opened = marginal.with_unknown_sigmas(problem)
+    opened = noise.with_unknown_sigmas(problem)
     assert opened.unknown_sigmas is not None and opened.unknown_sigmas.shape[0] == 1
     points = np.asarray(problem.space.start) + np.array([[0.0, 0.0], [0.2, -0.1]])
     log_sigmas = np.linspace(-4, 4, 4001)
@@ -382,13 +382,13 @@ def test_open_sigmas_are_integrated_out(correlated):
     ours = [float(opened.log_probability(jnp.asarray(u))) for u in points]
     assert ours[1] - ours[0] == pytest.approx(expected[1] - expected[0], rel=1e-6)
     with pytest.raises(ValueError, match="loss is 'student'; only with squares"):
-        marginal.with_unknown_sigmas(dataclasses.replace(problem, loss="student"))
+        noise.with_unknown_sigmas(dataclasses.replace(problem, loss="student"))
 
 
 def test_open_sigmas_are_drawn_around_the_residuals_own(correlated):
-    opened = marginal.with_unknown_sigmas(correlated)
+    opened = noise.with_unknown_sigmas(correlated)
     u = np.tile(np.asarray(correlated.space.start), (50, 30, 1))
-    draws = marginal.draw_sigmas(opened, u, seed=0)
+    draws = noise.draw_sigmas(opened, u, seed=0)
     residuals = np.asarray(correlated.residuals(correlated.space.start))[:-2]
     assert tuple(draws) == KINDS
     for kind, row in zip(KINDS, np.asarray(opened.unknown_sigmas), strict=True):

@@ -12,14 +12,13 @@ import pytest
 from jaxtyping import Array
 from scipy import special, stats
 
-from fitting.inference.sampling import diagnostics, posterior, prior_sensitivity, sampler
-from fitting.inference.sampling.chain import Chain, journal_path
-from fitting.inference.sampling.chain_file import Identity, RandomState
-from fitting.inference.sampling.posterior import Posterior, WalkerStart
-from fitting.inference.sampling.settings import SamplerSettings
-from fitting.problem.prior import SPREAD, Prior
+from fitting.inference.sample import diagnostics, posterior, prior_sensitivity, sampler
+from fitting.inference.sample.blocks import SamplerSettings
+from fitting.inference.sample.chain import Chain, Identity, RandomState, journal_path
+from fitting.inference.sample.posterior import Posterior, WalkerStart
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import autoregression
+from fitting.problem.space import SPREAD, Prior
 from support.problems import parameter, posterior_of, problem_of, problem_of_fractions
 
 TRACES = []  # one entry for each time that JAX traces the residuals

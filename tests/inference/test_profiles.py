@@ -13,25 +13,33 @@ import scipy.optimize
 import scipy.stats
 
 from fitting.inference.identifiability import Identifiability, assess_identifiability
-from fitting.inference.optimisation import population, search
-from fitting.inference.optimisation.population import Slopes
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.solution import Solution
-from fitting.inference.profiles.conditional import Conditional, Points, Targets
-from fitting.inference.profiles.curves import Curves
-from fitting.inference.profiles.heights import (
+from fitting.inference.optimise import evolution, search
+from fitting.inference.optimise.evolution import Slopes
+from fitting.inference.optimise.solution import SearchSettings, Solution
+from fitting.inference.profiles.conditional import (
+    Conditional,
+    Points,
+    Targets,
+    slopes_of_thresholds,
+)
+from fitting.inference.profiles.profile import (
     RISE_OF_SMOOTH,
     RISE_OF_THRESHOLD,
+    Curves,
     level_of,
     max_rise,
 )
-from fitting.inference.profiles.profiling import cross_cliffs
-from fitting.inference.profiles.secants import slopes_of_thresholds
-from fitting.inference.profiles.state import Profiling
-from fitting.problem.free_parameters import free_parameter, from_fractions, to_fractions
-from fitting.problem.prior import SPREAD, ParameterPrior, Priors
+from fitting.inference.profiles.profiling import Profiling, cross_cliffs
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
+from fitting.problem.space import (
+    SPREAD,
+    ParameterPrior,
+    Priors,
+    free_parameter,
+    from_fractions,
+    make_space,
+    to_fractions,
+)
 from fitting.runtime import threads
 from support import toy
 from support.curves import curve_problem
@@ -446,12 +454,12 @@ def test_a_fit_off_its_minimum_gets_a_lower_point_from_its_profiles():
     solution = search.find_best_fit(problem, starts=1)
     values = dict(zip(solution.names, solution.values, strict=True)) | {"turn": 0.6}
     u = np.asarray(problem.space.pack(values))
-    cost = float(population.evaluate(problem, u[None]).cost[0])
+    cost = float(evolution.evaluate(problem, u[None]).cost[0])
     moved = dataclasses.replace(
         solution, u=u, values=np.asarray(problem.space.values(jnp.asarray(u))), cost=cost
     )
     lower = assess_identifiability(problem, moved)
     assert lower.improvement > 0.9 * (cost - solution.cost) > 100
     assert lower.best_cost == pytest.approx(cost - lower.improvement)
-    again = population.evaluate(problem, lower.best_u[None]).cost[0]
+    again = evolution.evaluate(problem, lower.best_u[None]).cost[0]
     assert again == pytest.approx(lower.best_cost)

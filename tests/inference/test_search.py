@@ -12,18 +12,16 @@ import optimistix as optx
 import pytest
 
 from fitting.inference import settings
-from fitting.inference.optimisation import (
-    descent,
-    evolution,
-    levenberg_marquardt,
-    models,
-    population,
-    search,
-    sweep,
+from fitting.inference.optimise import descent, evolution, levenberg_marquardt, search
+from fitting.inference.optimise.solution import (
+    ROUNDING,
+    Point,
+    Search,
+    SearchSettings,
+    SearchState,
+    Solution,
+    StepsUsedUp,
 )
-from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.solution import Solution
-from fitting.inference.optimisation.state import ROUNDING, Point, Search, SearchState, StepsUsedUp
 from fitting.problem.problem import Problem
 from support import toy
 from support.curves import CURVE_TRUTH, Curve, curve_problem
@@ -143,7 +141,9 @@ def valley(ik: Fractions, data: jax.Array) -> jax.Array:
     return data * jnp.stack([1 - u[0], u[1] - u[0] ** 2])
 
 
-def march(model: models.Model, u: jax.Array, steps: int) -> list[levenberg_marquardt.LMState]:
+def march(
+    model: levenberg_marquardt.Model, u: jax.Array, steps: int
+) -> list[levenberg_marquardt.LMState]:
     """The states before and after each of our steps."""
     states = [levenberg_marquardt.begin(model, u)]
     for _ in range(steps):
@@ -162,7 +162,7 @@ def optimum(residuals, u: jax.Array, steps: int) -> jax.Array:
 def test_steps_on_the_compressed_rows_are_those_of_optimistix_on_all_rows():
     problem = problem_of_fractions(2, jnp.asarray([1.0, 10.0]), valley)
     start = jnp.asarray((-1.2, 1.0))
-    states = march(models.HardModel(problem, start), start, 20)
+    states = march(levenberg_marquardt.HardModel(problem, start), start, 20)
     for steps in (2, 20):
         expected = optimum(problem.residuals, start, steps)
         np.testing.assert_allclose(states[steps].u, expected, rtol=1e-9, err_msg=f"{steps}")
@@ -171,7 +171,7 @@ def test_steps_on_the_compressed_rows_are_those_of_optimistix_on_all_rows():
     last = states[-1]
     assert float(last.cost) < 0.1 * float(problem.cost(start))
     np.testing.assert_allclose(last.cost, problem.cost(last.u), rtol=1e-12)
-    jacobian = models.problem_jacobian(last.jacobian)
+    jacobian = levenberg_marquardt.problem_jacobian(last.jacobian)
     np.testing.assert_allclose(jacobian, problem.jacobian(last.u), rtol=1e-12)
     # A weak type in the state, say, would compile the second step anew.
     assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
@@ -190,13 +190,13 @@ def test_a_jacobian_is_computed_only_where_the_cost_is_low_enough():
 @pytest.mark.parametrize("rows", [3, 5, 127, 128, 129, 20000])
 def test_the_triangular_factor_has_the_gram_matrix_of_all_rows(rows):
     tall = np.random.default_rng(rows).normal(size=(rows, 5)) * [1.0, 1e-3, 1e3, 1.0, 1.0]
-    triangle = np.asarray(models.triangular_factor(jnp.asarray(tall)))
+    triangle = np.asarray(levenberg_marquardt.triangular_factor(jnp.asarray(tall)))
     assert triangle.shape == (5, 5)
     np.testing.assert_array_equal(triangle, np.triu(triangle))
     np.testing.assert_allclose(triangle.T @ triangle, tall.T @ tall, rtol=1e-10, atol=1e-10)
     if rows >= 5:
         np.testing.assert_allclose(np.abs(triangle), np.abs(np.linalg.qr(tall, "r")), rtol=1e-8)
-    program = str(jax.make_jaxpr(models.triangular_factor)(tall))
+    program = str(jax.make_jaxpr(levenberg_marquardt.triangular_factor)(tall))
     shapes = re.findall(r"\[([\d,]+)\] = qr\[", program)
     # Of several blocks at once, threads that compute factors would wait for each other for ever.
     assert shapes and all(shape.count(",") == 1 for shape in shapes)
@@ -287,9 +287,9 @@ def test_costs_of_candidates_agree_with_those_of_one_point():
         candidates = problem.space.prior.draw(np.random.default_rng(1), 100).astype(dtype)
         costs = jax.jit(jax.vmap(problem.cost))(jnp.asarray(candidates, float))
         expected = np.where(np.isfinite(costs), costs, np.inf)
-        rough = population.evaluate(problem, candidates).cost
+        rough = evolution.evaluate(problem, candidates).cost
         assert np.isfinite(expected).sum() > 50
-        np.testing.assert_allclose(rough, expected, rtol=population.ROUNDING)
+        np.testing.assert_allclose(rough, expected, rtol=evolution.ROUNDING)
 
 
 def test_a_search_keeps_the_type_of_its_numbers():
@@ -319,7 +319,7 @@ STAGES = {
     "descent": lambda search, state: descent.descend(search, state, "descent"),
     "polish": descent.polish,
     "evolution": evolve,
-    "sweep": lambda search, state: sweep.sweep_and_descend(search, state, 1),
+    "sweep": lambda search, state: evolution.sweep_and_descend(search, state, 1),
 }
 
 
@@ -356,7 +356,7 @@ def test_variations_keep_the_values_that_they_do_not_move():
 
 def test_a_stage_stops_without_sufficient_gain_or_when_the_steps_of_a_start_are_used_up():
     search, state = threshold_search(min_sweep_gain=1.0, max_steps=3)
-    after = sweep.sweep(search, state)
+    after = evolution.sweep(search, state)
     assert after.point is state.point
     assert after.sweeps == search.settings.sweep_tries
     with pytest.raises(StepsUsedUp) as caught:
@@ -368,7 +368,7 @@ def test_a_stage_stops_without_sufficient_gain_or_when_the_steps_of_a_start_are_
 def test_each_sweep_looks_in_the_widest_gap_that_the_sweeps_before_have_left():
     offsets: list[float] = []
     for number in range(40):
-        offset = sweep.offset(number)
+        offset = evolution.offset(number)
         assert 0 <= offset < 1
         if offsets:
             ends = np.sort([*offsets, min(offsets) + 1])  # once around

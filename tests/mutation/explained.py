@@ -26,50 +26,52 @@ ROUNDING = "a few more or less roundings are as good"
 LOOK = "changes how a picture looks, which the eye judges"
 NO_SIGN = "any negative number lets NumPy work out the length"
 REASONS = {
-    "fitting/report/plots/calibration_plots.py": [("Line2D([], [], color=", "", LOOK)],
-    "fitting/report/plots/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
-    "fitting/report/hierarchy/population_plots.py": [("columns=5", "columns= 4", LOOK)],
-    "fitting/bench/benchmarks/baselines.py": [
+    "fitting/studies/calibrate/calibration_report.py": [("Line2D([], [], color=", "", LOOK)],
+    "fitting/studies/fit/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
+    "fitting/studies/population/population_report.py": [("columns=5", "columns= 4", LOOK)],
+    "fitting/bench/kernels.py": [
         ("(flat_ankle, axis=-1)", "(flat_ankle, axis=1)", "there are two axes")
     ],
-    "fitting/bench/scaling_plot.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
-    "fitting/cli/terminal/drawing.py": [
+    "fitting/bench/report.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
+    "fitting/cli/terminal.py": [
         ("default=0", "default= 1", "the longest word counts only where it is long")
     ],
-    "fitting/datasets/clips/formats/gltf/writer.py": [("GREY = [", "", LOOK)],
-    "fitting/datasets/flat_animation.py": [
+    "fitting/clips/formats/gltf_writer.py": [("GREY = [", "", LOOK)],
+    "fitting/motion/flat_animation.py": [
         ("(joints, after, strict=True", "(joints, after, strict=False", GUARD)
     ],
-    "fitting/datasets/synthetic/footsteps.py": [
+    "fitting/synthetic/footsteps.py": [
         ("landed[1:] & landed", "landed[1:] | landed", "as a foot lifts or lands, nothing changes")
     ],
-    "fitting/datasets/terrain/block_grids.py": [
+    "fitting/ground/reconstruction.py": [
         ("LATTICE = (-3", "LATTICE = (- 2", "grids within the same range are as good")
     ],
-    "fitting/datasets/terrain/mesh_files.py": [
+    "fitting/ground/meshes.py": [
         ("hits: bool = True", "hits: bool = False", "a protocol's default is never taken")
     ],
-    "fitting/inference/choice.py": [("scenes, u), strict=True", "scenes, u), strict=False", GUARD)],
-    "fitting/inference/noise/series.py": [
+    "fitting/inference/sensitivity.py": [
+        ("scenes, u), strict=True", "scenes, u), strict=False", GUARD)
+    ],
+    "fitting/inference/noise.py": [
         ("ITERATIONS = 100", f"ITERATIONS = {number}", "the last reweighting changes nothing")
         for number in (99, 101)
     ],
-    "fitting/viewer/overlays.py": [("(230, 159, 0)", "", LOOK)],
+    "fitting/viewer/solving.py": [("(230, 159, 0)", "", LOOK)],
     "fitting/studies/drafts/draft.py": [
         ("rig = data[0]", "rig = data[ -1]", "either clip has a body to start from")
     ],
-    "fitting/studies/calibration/replicates.py": [
+    "fitting/studies/calibrate/replicates.py": [
         ("noise_factor: float = 1.0", "", "the calibration always says which")
     ],
-    "fitting/inference/optimisation/kept_stages.py": [("(before.best, before.point)", "[]", SPEED)],
+    "fitting/inference/optimise/checkpoints.py": [("(before.best, before.point)", "[]", SPEED)],
     "fitting/inference/profiles/conditional.py": [
         ("CANDIDATES = 12", f"CANDIDATES = {number}", "a random candidate more or less is as good")
         for number in (11, 13)
     ],
-    "fitting/inference/profiles/single_moves.py": [
+    "fitting/inference/profiles/profiling.py": [
         ("GENERATIONS = 2", "GENERATIONS = 3", "more random combinations are as good")
     ],
-    "fitting/inference/sampling/sampler.py": [
+    "fitting/inference/sample/sampler.py": [
         ("length // 2", "length // 3", "two thirds of a chain teach as much as its last half")
     ],
     "jaxik/solvers/two_bone.py": [

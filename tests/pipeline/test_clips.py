@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.synthetic import walker
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import character, packing
 from jaxik.pipeline.tracks import Tracks

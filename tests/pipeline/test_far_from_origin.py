@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.synthetic import walker
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.synthetic import walker
 from jaxik import presets
 from jaxik.world import terrain
 from jaxik.world.places import LATTICE

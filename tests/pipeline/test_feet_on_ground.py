@@ -16,10 +16,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import clip_frames
-from fitting.datasets.clips import Clip, contacts, load_clip
-from fitting.datasets.clips.edit import drop_t_pose, resample
-from fitting.datasets.synthetic import gait, walker
+from fitting.clips import Clip, clip_frames, contacts, load_clip
+from fitting.clips.edit import drop_t_pose, resample
+from fitting.synthetic import footsteps, walker
 from jaxik.maths import quat
 from jaxik.world import terrain
 from reference import maths, sample_poses
@@ -165,7 +164,7 @@ class Figure(NamedTuple):
         )
         points = []
         for joint, below in (
-            (pose.ankle, [0.0, -self.ankle_height, -gait.HEEL]),
+            (pose.ankle, [0.0, -self.ankle_height, -footsteps.HEEL]),
             (pose.toe, [0.0, -self.ball_height, 0.0]),
         ):
             foot = (ankle * of_foot).apply(below)
@@ -194,7 +193,7 @@ def figures() -> dict[str, Figure]:
     walker_rig = dataclasses.replace(clip.rig, **static)  # others would be another program
     known = clip_frames.frames_from_clip(clip)
     stride = dataclasses.replace(known.stride, known=0.0 * known.stride.known)
-    heights = gait.ANKLE_HEIGHT, gait.BALL_HEIGHT
+    heights = footsteps.ANKLE_HEIGHT, footsteps.BALL_HEIGHT
     return {
         "standing": Figure(rig, standing, sample_poses.ANKLE, 0.02),
         "known": Figure(walker_rig, known, *heights),

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.synthetic import walker
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.synthetic import walker
 from jaxik import Smooth, Transform
 from jaxik.maths import parameter_tree, quat
 from jaxik.world.skeleton import bone_lengths

@@ -14,15 +14,14 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.synthetic import walker
-from fitting.experiments import experiment_files, parameter_files, problems
-from fitting.experiments.experiment import Experiment
-from fitting.problem import residuals
-from fitting.problem.capture import ground, observation
-from fitting.problem.capture.parameters import Capture
-from fitting.problem.capture.system import CapturedSystem, parted
-from fitting.studies import run_folder
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.experiment import experiment_files, parameter_files, problems
+from fitting.experiment.experiment import Experiment
+from fitting.problem import capture_system, residuals
+from fitting.problem.capture_system import CapturedSystem, parted
+from fitting.problem.scene import Capture
+from fitting.studies.fit import run_folder
+from fitting.synthetic import walker
 from jaxik.world import terrain as terrains
 from jaxik.world.skeleton import Transform
 from support.experiments import CLIP, SECOND, write
@@ -49,7 +48,7 @@ def test_rays_meet_raised_ground_where_a_mesh_with_moved_vertices_is():
             terrains.mesh(points, triangles) for points in (vertices, raised_points(vertices))
         )
         numbers = (jnp.asarray(HEIGHT), (jnp.asarray(TILT_X), jnp.asarray(TILT_Z)))
-        raised = ground.raised(terrain, jnp.asarray(CENTRE), *numbers)
+        raised = capture_system.raised(terrain, jnp.asarray(CENTRE), *numbers)
         rays = jnp.asarray(np.random.default_rng(1).uniform(-0.8, 0.8, (200, 3)) + [0, 2, 0])
         found, wanted = (terrains.cast(each, rays, 5.0) for each in (raised, moved))
         assert np.asarray(wanted.found).all()
@@ -88,7 +87,7 @@ def shown(walk: Any, **numbers: float) -> tuple[jaxik.LegPose, Transform]:
         return compiled(dataclasses.replace(Capture(), **numbers), *walk)
 
 
-compiled = eqx.filter_jit(observation.shown)  # one program for all tests
+compiled = eqx.filter_jit(capture_system.shown)  # one program for all tests
 
 
 def rotations(joint: Transform) -> Rotation:
@@ -153,7 +152,7 @@ def test_a_late_capture_shows_what_was_before(walk, shift):
     weights = jnp.arange(len(pos), dtype=float)
     with jax.enable_x64(True):
         capture = dataclasses.replace(Capture(), time_shift=shift)
-        later = observation.delayed(capture, frames, weights)
+        later = capture_system.delayed(capture, frames, weights)
     assert np.allclose(np.asarray(later)[4:-4], np.arange(len(pos))[4:-4] - shift * fps)
 
 
@@ -252,7 +251,7 @@ def test_errors_are_those_from_what_the_capture_would_show(tmp_path):
     assert max(largest["captured"].values()) < 1e-9
     assert largest["as it seems"]["ankle"] > 0.015 and largest["as it seems"]["pelvis"] > 0.001
     assert type(ik) is jaxik.FootIK
-    assert isinstance(captured.terrain.surfaces[0], ground.RaisedSurface)
+    assert isinstance(captured.terrain.surfaces[0], capture_system.RaisedSurface)
 
 
 def test_the_parameters_of_a_run_are_those_of_the_system_alone(tmp_path):

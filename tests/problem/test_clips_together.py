@@ -17,11 +17,10 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import jaxik
-from fitting.experiments import experiment_files, problems
+from fitting.experiment import experiment_files, problems
 from fitting.inference.sharding import over_devices
-from fitting.problem import stacking
-from fitting.problem.digest import digest
-from fitting.problem.problem import Problem
+from fitting.problem import shared_world
+from fitting.problem.problem import Problem, digest
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import MARGIN, run_row, run_scenes, share_world
@@ -235,19 +234,19 @@ def test_clips_on_one_ground_are_one_stack_and_keep_their_order_and_none_is_made
     problem = on_devices.make_problem()
     assert over_devices(problem) is problem, "on one device"
     scenes = problem.data
-    (stack,) = stacking.stack(scenes)
+    (stack,) = shared_world.stack(scenes)
     assert stack.members == (0, 1, 2) and stack.shares_terrain
     for number, scene in enumerate(scenes):
         observed = np.asarray(stack.one(number).reference.observed)
         assert observed.sum() == np.asarray(scene.reference.observed).sum()
-    frames = stacking.frame_count(scenes[0])
+    frames = shared_world.frame_count(scenes[0])
     with pytest.raises(ValueError, match=f"has {frames} frames; wanted at most 3"):
-        stacking.padded(scenes[0], 3)
+        shared_world.padded(scenes[0], 3)
 
 
 def test_lengths_are_rounded_up_to_a_few_by_a_quarter_at_most():
     lengths = np.arange(1, 5000)
-    rounded = np.array([stacking.rounded_up(length) for length in lengths.tolist()])
+    rounded = np.array([shared_world.rounded_up(length) for length in lengths.tolist()])
     assert (lengths <= rounded).all() and (np.diff(rounded) >= 0).all()
     assert (rounded / np.maximum(lengths, 32)).max() <= 1.26
     assert len(set(rounded.tolist())) < 30

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from fitting.experiments import systems
-from fitting.problem.free_parameters import free_parameter
-from fitting.problem.loss import (
+from fitting.experiment import systems
+from fitting.problem.problem import (
     CAUCHY,
     HUBER,
     TAILS,
@@ -23,9 +22,20 @@ from fitting.problem.loss import (
     rho,
     slope_of_rho,
 )
-from fitting.problem.prior import LOGISTIC_SD, SPREAD, ParameterPrior, Prior, Priors
-from fitting.problem.prior_probability import prior_probability
-from fitting.problem.space import CENTRE_LIMIT, INTERVAL, OWN_CENTRE_LIMIT, Space, make_space
+from fitting.problem.space import (
+    CENTRE_LIMIT,
+    INTERVAL,
+    LOGISTIC_SD,
+    OWN_CENTRE_LIMIT,
+    SPREAD,
+    ParameterPrior,
+    Prior,
+    Priors,
+    Space,
+    free_parameter,
+    make_space,
+    prior_probability,
+)
 from jaxik.maths import parameter_tree, smoothing
 from support import toy
 from support.problems import Fractions, problem_of

@@ -13,8 +13,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.experiments import experiment_files, problems
-from fitting.experiments.known_values import load_known_values
+from fitting.experiment import experiment_files, problems
+from fitting.experiment.problems import load_known_values
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import autoregression, simulate

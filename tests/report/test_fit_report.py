@@ -17,33 +17,27 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from fitting.analysis import limit_activity, playback
-from fitting.analysis.capture_signs.ground import GroundOffset
-from fitting.analysis.goodness import verdict
-from fitting.datasets.synthetic import walker
-from fitting.experiments import experiment_files, known_values
-from fitting.experiments.experiment import ClipEntry, Experiment
-from fitting.experiments.problems import ClipData, make_scene
+from fitting.experiment import experiment_files, problems
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.optimisation.solution import Progress, Solution
-from fitting.inference.sampling import inference_data
-from fitting.inference.sampling.islands import Island
-from fitting.inference.sampling.posterior import Posterior
+from fitting.inference.noise import NoiseOptions
+from fitting.inference.optimise.solution import Progress, Solution
+from fitting.inference.sample import inference_data
+from fitting.inference.sample.modes import Island
+from fitting.inference.sample.posterior import Posterior
+from fitting.motion import goodness, playback
 from fitting.problem import residuals
-from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import Space, make_space
-from fitting.report import fit_report, posterior_report
+from fitting.problem.space import ParameterPrior, Priors, Space, make_space
 from fitting.report.formatting import markdown
-from fitting.report.goodness import capture_report, goodness_report
-from fitting.report.plots import posterior_plots
-from fitting.report.uncertainty import islands, priors
-from fitting.runtime.display import notebook
-from fitting.studies import run_folder
-from fitting.studies.fit import Fit
-from fitting.studies.motions.capture_signs import CaptureSigns
-from fitting.studies.sample import SampledFit
+from fitting.runtime import display
+from fitting.studies.fit import fit_report, goodness_report, run_folder
+from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
+from fitting.studies.fit.fit import Fit
+from fitting.studies.sample import posterior_plots, posterior_report, prior_report
+from fitting.studies.sample.sample import SampledFit
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support import toy
@@ -113,7 +107,7 @@ def fitted(experiment) -> Fit:
         best_cost=99.75,
         improvement=0.25,
     )
-    known = known_values.load_known_values(experiment)
+    known = problems.load_known_values(experiment)
     return Fit(experiment, problem, solution, identifiability, known)
 
 
@@ -130,21 +124,21 @@ def test_known_values_are_those_of_the_first_clip_that_has_any(experiment, tmp_p
     values = {"contact.planted_height": 0.10, "pelvis.on_gain": 0.5}
     values |= {"probe.toe_ls": pytest.approx(0.13 / 3)}
     values |= {"probe.toe_ls[0]": 0.0, "probe.toe_ls[1]": -0.07, "probe.toe_ls[2]": 0.2}
-    assert known_values.load_known_values(experiment) == values
-    assert known_values.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
+    assert problems.load_known_values(experiment) == values
+    assert problems.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
     one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
-    assert (known_values.load_known_values(one_leg) or {})["pelvis.on_gain[1]"] == 0.5
+    assert (problems.load_known_values(one_leg) or {})["pelvis.on_gain[1]"] == 0.5
     (tmp_path / "broken.toml").write_text("contact = [")
     broken = replace(experiment.clips[0], truth=tmp_path / "broken.toml")
     with pytest.raises(ValueError, match=r"broken\.toml: not TOML"):
-        known_values.load_known_values(replace(experiment, clips=(broken,)))
+        problems.load_known_values(replace(experiment, clips=(broken,)))
 
 
 def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted, experiment):
     text = fit_report.fit_text(fitted)
     assert text.startswith(fitted.verdict.sentence) and "\nNot converged: the 8 steps" in text
     assert "Cost 900 before, 100 after: 8 steps" in text
-    distance = verdict.size("ankle", fitted.distances.parts["fitted"]["fitted"]["ankle"])
+    distance = goodness.size("ankle", fitted.distances.parts["fitted"]["fitted"]["ankle"])
     assert re.split(r"\s{2,}", line_of(text, "ankles  "))[1::3] == ["fitted", distance]
     # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.
     planted = line_of(text, "contact.planted_height")
@@ -176,14 +170,14 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert centre is not None and centre == pytest.approx(planted["before"])
     u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
     np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
-    text = "\n".join(priors.prior_section(rows))
+    text = "\n".join(prior_report.prior_section(rows))
     low, high = planted["prior"]["interval"]
     assert line_of(text, "contact.planted_height") == (
         f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
         "| 0.1 to 0.12 |"
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
-    text = "\n".join(priors.prior_section(fitted.summary["parameters"]))
+    text = "\n".join(prior_report.prior_section(fitted.summary["parameters"]))
     assert "| normal | 0.9667 (system: 1) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
@@ -212,12 +206,12 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
     assert f"**{fitted.verdict.sentence}**" in text.split("## Goodness of fit")[1]
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | at least 0.85 | 0.85 to 1 | 0.100 |" in text
-    nudges = limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u)
+    nudges = playback.nudge_thresholds(fitted.problem, fitted.solution.u)
     down, up = nudges["contact.planted_height"]
     nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
     for nudge in (down, up):
         assert f"| {100 * nudge.flipped:.2f} % | {nudge.rise:+.1f} |" in nudged
-    (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+    (activity,) = playback.measure(fitted.ik, fitted.problem.data, fitted.results)
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
 
@@ -239,7 +233,7 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     assert set(by_kind) == set(playback.RESIDUAL_KINDS)
     assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
     # What a translation leaves is measured in tolerances.
-    (_, sentence, _, *texts) = goodness_report.section(replace(fitted, has_noise=False))
+    (_, sentence, _, *texts) = goodness_report.goodness_section(replace(fitted, has_noise=False))
     assert sentence.startswith(("**Not the same motion: ", "**The same motion"))
     assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
 
@@ -274,7 +268,7 @@ def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(f
 
     def active(changed):
         ik = parameter_tree.replace(fitted.ik, changed)
-        return limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))[0]
+        return playback.active_limits(ik, (scene,), (playback.run(ik, scene),))[0]
 
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
     ends = active(values)
@@ -283,7 +277,7 @@ def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(f
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
-    (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+    (activity,) = playback.measure(fitted.ik, fitted.problem.data, fitted.results)
     (result,) = fitted.results
     locked = np.asarray(playback.stage_outputs(result).advanced.state.lock.locked)
     assert activity.frames == 30 and activity.seconds == pytest.approx(2.0)
@@ -302,7 +296,7 @@ def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     unlocked = make_space(base, space.parameters)
     problem = Problem(unlocked, (scene,), residuals.residuals_of_scenes)
     u = np.asarray(unlocked.pack(VALUES))
-    down, up = limit_activity.nudge_thresholds(problem, u)["contact.planted_height"]
+    down, up = playback.nudge_thresholds(problem, u)["contact.planted_height"]
     lift = np.asarray(scene.frames.pose.ankle.pos[..., 1])
     # Of the four decisions per foot and frame, only `planted` depends on the threshold.
     assert down.flipped == pytest.approx(np.mean((0.07 < lift) & (lift <= 0.11)) / 4)
@@ -476,7 +470,9 @@ def test_islands_are_shown_with_weights_exchanges_and_medians():
     found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
     assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(islands=found)
     space = space_of(NAMES)
-    section = islands.island_section(toy_posterior(islands=found), space, dict.fromkeys(NAMES, "1"))
+    section = posterior_report.island_section(
+        toy_posterior(islands=found), space, dict.fromkeys(NAMES, "1")
+    )
     text = "\n".join(section)
     assert "| 1 | 81.0 % ± 1.2 % | 250 | 4 | -12.5 |" in text
     first, second = (np.asarray(space.values(jnp.full(2, u))) for u in (0.0, 1.5))
@@ -485,7 +481,7 @@ def test_islands_are_shown_with_weights_exchanges_and_medians():
     found = (island(0.75, 3, 0.0), island(0.25, 3, 1.5))  # hardly any exchanges
     text = text_of(islands=found)
     assert "out of reach (75.0 % of the draws), out of reach (25.0 % of the draws)" in text
-    table = markdown(islands.island_table(found))
+    table = markdown(posterior_report.island_table(found))
     assert "| 2 | out of reach (25.0 % of the draws) | 3 |" in table
 
 
@@ -538,7 +534,7 @@ def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp
     assert clips[1] == [*files, "1 s", "2 s"]
     assert [row[0] for row in free[1:]] == ["pelvis.on_gain", "foot.max_pitch"]
     assert free[2][3] == "0.1 to 1.4"
-    assert notebook.html("a < b") == "<pre>&#x27;a &lt; b&#x27;</pre>", "as is anything else"
+    assert display.html("a < b") == "<pre>&#x27;a &lt; b&#x27;</pre>", "as is anything else"
 
 
 def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted):
@@ -581,7 +577,7 @@ def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_sys
     text = fit_report.fit_text(shown)
     system, _, capture = text.partition("The capture:")
     assert "capture.ground_height" in capture and "capture.ground_height" not in system
-    sentences = capture_report.sentences(shown)
+    sentences = goodness_report.sentences(shown)
     assert [line in text for line in sentences] == [True] * 3
     assert sentences[0] == (
         "Standing feet are 2.9 cm in the ground in the median of 14 stances, which scatter by "
@@ -589,10 +585,13 @@ def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_sys
     )
     assert "1.2° along z: a tilted floor? `[capture] ground_tilt_z = {}`" in sentences[1]
     assert "31 ms before the fitted ones: a time shift? `[capture] time_shift" in sentences[2]
-    section = "\n".join(capture_report.section(shown, None))
+    section = "\n".join(goodness_report.capture_section(shown, None))
     assert section.startswith("## The capture") and "capture.ground_height" in section
     freed = replace(shown, experiment=replace(shown.experiment, capture={"time_shift": {}}))
     vars(freed)["capture_signs"] = vars(shown)["capture_signs"]
-    assert len(capture_report.sentences(freed)) == 2  # what is fitted needs no remedy
+    assert len(goodness_report.sentences(freed)) == 2  # what is fitted needs no remedy
     vars(freed)["capture_signs"] = [CaptureSigns(GroundOffset(0.0, 0.01, 14), 0.0)] * 2
-    assert capture_report.sentences(freed) == [] and capture_report.section(fitted, None) == []
+    assert (
+        goodness_report.sentences(freed) == []
+        and goodness_report.capture_section(fitted, None) == []
+    )

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from fitting.report import comparison_report
-from fitting.report.page import rendering
-from fitting.report.page.comparisons import compare_page, runs_page
-from fitting.studies.posterior.run_comparison import ComparedRun
+from fitting.report import pages
+from fitting.studies.compare import comparison_report
+from fitting.studies.sample import run_comparison
+from fitting.studies.sample.run_comparison import ComparedRun
 from support import comparisons, runs
 from support.browsers import launch, needs_chromium
 from support.pages import Page
@@ -37,7 +37,7 @@ pytestmark = needs_chromium
 def path(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     runs.write_run(folder, runs.with_clips(runs.invented_fit(folder)))
-    return folder / rendering.PAGE
+    return folder / pages.PAGE
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +46,16 @@ def comparison_path(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("compared")
     compared = comparisons.invented_comparison(comparisons.walk())
     Image.new("RGB", (1700, 900), "white").save(folder / comparison_report.FIGURE)
-    compare_page.write(folder, compared)
-    return folder / rendering.PAGE
+    comparison_report.write_page(folder, compared)
+    return folder / pages.PAGE
 
 
 @pytest.fixture(scope="module")
 def plain_path(tmp_path_factory) -> Path:
     """A page without a view."""
     folder = tmp_path_factory.mktemp("plain")
-    runs_page.write(folder, RUNS)
-    return folder / rendering.PAGE
+    run_comparison.write_page(folder, RUNS)
+    return folder / pages.PAGE
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_all_bones_throw_a_shadow_however_many_there_are(open_page, path, tmp_pa
     whole = path.read_text()
     start = whole.index(">", whole.index('id="data"')) + 1
     end = whole.index("</script>", start)
-    crowded.write_text(whole[:start] + str(rendering.as_json(data)) + whole[end:])
+    crowded.write_text(whole[:start] + str(pages.as_json(data)) + whole[end:])
     pictures = []
     for shown_path in (path, crowded):
         page = open_page(path=shown_path)

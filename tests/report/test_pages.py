@@ -13,33 +13,23 @@ from matplotlib.patches import StepPatch
 from PIL import Image
 from scipy import stats
 
-from fitting.analysis import worst_window
-from fitting.analysis.accuracy import Accuracy
-from fitting.analysis.difference import QUANTITIES
-from fitting.analysis.measures import Measures
-from fitting.analysis.misplacement import Cause
-from fitting.analysis.placement import Extreme, Placement
-from fitting.analysis.playback import RESIDUAL_KINDS
-from fitting.analysis.worst_window import find_worst_window
-from fitting.datasets import ground_patch
-from fitting.datasets.clips import load_clip
+from fitting.clips import load_clip
+from fitting.ground import ground_patch
+from fitting.motion import worst_window
+from fitting.motion.accuracy import QUANTITIES, Accuracy
+from fitting.motion.measures import Cause, Extreme, Measures, Placement
+from fitting.motion.playback import RESIDUAL_KINDS
+from fitting.motion.worst_window import find_worst_window
 from fitting.problem.scene import legs_ws
-from fitting.report import comparison_report, labels, placement_report, worst_window_report
-from fitting.report.page import (
-    fit_page,
-    motion_data,
-    pictures,
-    posterior_section,
-    rendering,
-    sentences,
-)
-from fitting.report.page.comparisons import compare_page, compare_sentences, runs_page
-from fitting.report.page.study_page import Finding, Grid, Section, StudyPage, Text
-from fitting.report.plots import goodness_plots, worst_window_plots
-from fitting.report.plots.style import save
-from fitting.studies.fit import Fit
-from fitting.studies.motions import comparison_motions, fit_motions
-from fitting.studies.posterior.run_comparison import ComparedRun
+from fitting.report import formatting, motion_data, pages
+from fitting.report.pages import Finding, Grid, Section, StudyPage, Text
+from fitting.report.style import save
+from fitting.studies.animations import placement_report
+from fitting.studies.compare import comparison, comparison_report
+from fitting.studies.fit import fit_motions, fit_page, fit_plots, identifiability_report, sentences
+from fitting.studies.fit.fit import Fit
+from fitting.studies.sample import posterior_report, run_comparison
+from fitting.studies.sample.run_comparison import ComparedRun
 from support import comparisons, runs
 from support.comparisons import DEEP
 from support.experiments import ROOT
@@ -48,12 +38,17 @@ from support.playbacks import FRAMES, LEGS, error, playback
 
 
 def test_every_figure_has_a_label_in_the_same_order_and_is_shown_in_its_unit():
-    for figures, columns in ((Accuracy, labels.ACCURACY), (Measures, labels.MEASURES)):
+    for figures, columns in ((Accuracy, formatting.ACCURACY), (Measures, formatting.MEASURES)):
         assert list(columns) == [field.name for field in dataclasses.fields(figures)]
-    assert list(labels.RESIDUALS) == list(RESIDUAL_KINDS)
-    assert list(labels.DIFFERENCES) == list(QUANTITIES)
+    assert list(formatting.RESIDUALS) == list(RESIDUAL_KINDS)
+    assert list(formatting.DIFFERENCES) == list(QUANTITIES)
     factors = {"%": 100, "cm": 100, "mm": 1000, "°": math.degrees(1), "degrees": math.degrees(1)}
-    for table in (labels.ACCURACY, labels.MEASURES, labels.RESIDUALS, labels.DIFFERENCES):
+    for table in (
+        formatting.ACCURACY,
+        formatting.MEASURES,
+        formatting.RESIDUALS,
+        formatting.DIFFERENCES,
+    ):
         for column in table.values():
             assert column.factor == factors.get(column.unit.split()[0], 1), column
     for name, value, shown in (
@@ -62,7 +57,7 @@ def test_every_figure_has_a_label_in_the_same_order_and_is_shown_in_its_unit():
         ("pops", 12.0, "12"),
         ("slide", math.nan, "–"),
     ):
-        assert labels.MEASURES[name].format(value) == shown
+        assert formatting.MEASURES[name].format(value) == shown
 
 
 # How feet are placed on their ground
@@ -137,7 +132,7 @@ def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cau
 
 
 def describe(play) -> str:
-    return " ".join(worst_window_report.describe(play, find_worst_window(play), LEGS))
+    return " ".join(identifiability_report.describe(play, find_worst_window(play), LEGS))
 
 
 def test_the_text_gives_direction_size_and_time_of_the_largest_error():
@@ -204,7 +199,7 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
     seen[130:133] = False
     play = playback(error("ankle", 120, 0.0, 0.1, 0.0, leg=0), seen=seen, stance=stance)
     window = find_worst_window(play)
-    figure = worst_window_plots.worst_window(play, LEGS, window, "hill: the worst two seconds")
+    figure = fit_plots.worst_window(play, LEGS, window, "hill: the worst two seconds")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     names = ["Left ankle", "Right ankle", "Pelvis", "Left knee", "Right knee"]
     assert [title.partition(",")[0].partition(" (")[0] for title in titles] == names
@@ -220,7 +215,7 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
 
 def test_normal_residuals_are_drawn_beside_the_density_of_the_normal_distribution():
     knees = {"knee": np.random.default_rng(1).normal(0.0, 0.03, (FRAMES, 2, 3))}
-    _, _, _, axes, *_ = goodness_plots.noise(playback(knees), "are the residuals noise?").axes
+    _, _, _, axes, *_ = fit_plots.noise(playback(knees), "are the residuals noise?").axes
     across, density = map(np.asarray, axes.lines[0].get_data())
     np.testing.assert_allclose(density, stats.norm.pdf(across))
     (steps,) = axes.patches
@@ -254,7 +249,7 @@ def run(fitted, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(run) -> Page:
-    return Page(run / rendering.PAGE)
+    return Page(run / pages.PAGE)
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +295,7 @@ def test_the_page_says_what_was_found(page, fitted):
     assert fitted.verdict.sentence.replace("`", "") in page.text
     (play,) = fitted.playbacks
     window = worst_window.find_worst_window(play)
-    for line in worst_window_report.describe(play, window, ("left", "right")):
+    for line in identifiability_report.describe(play, window, ("left", "right")):
         assert line in page.text
     assert "leg.max_knee_angle 50.0 %" in page.text
     assert "never act in these clips: pelvis.limit." in page.text
@@ -313,20 +308,20 @@ def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, mon
 
 
 def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
-    page = (run / rendering.PAGE).read_text()
-    (tmp_path / rendering.PAGE).write_text(page)
+    page = (run / pages.PAGE).read_text()
+    (tmp_path / pages.PAGE).write_text(page)
     for count in (1, 2):
         lines = [f"chain {count} <b>"]
         first = ["`jaxik fit` <i>: **run** it"]
-        posterior_section.insert(tmp_path, first, lines, [["parameter"], ["x"]])
-    sampled = Page(tmp_path / rendering.PAGE)
+        posterior_report.insert(tmp_path, first, lines, [["parameter"], ["x"]])
+    sampled = Page(tmp_path / pages.PAGE)
     assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
     assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
     assert sampled.headings.count("h2 Posterior") == 1
-    assert sampled.data == Page(run / rendering.PAGE).data
-    (tmp_path / rendering.PAGE).write_text("of another kind")
-    posterior_section.insert(tmp_path, [], [], [["parameter"]])
-    assert (tmp_path / rendering.PAGE).read_text() == "of another kind"
+    assert sampled.data == Page(run / pages.PAGE).data
+    (tmp_path / pages.PAGE).write_text("of another kind")
+    posterior_report.insert(tmp_path, [], [], [["parameter"]])
+    assert (tmp_path / pages.PAGE).read_text() == "of another kind"
 
 
 def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, motions):
@@ -407,9 +402,9 @@ def test_a_run_keeps_its_flat_animation_and_its_fitted_motion(run, fitted):
 def test_many_names_become_a_number_and_data_cannot_end_its_script_element():
     texts = [sentences.listed(list("abcd"[:count])) for count in (1, 2, 3, 4)]
     assert texts == ["a", "a and b", "a, b and c", "a, b and 2 others"]
-    assert "<" not in rendering.as_json({"a": "</script><!--"})
+    assert "<" not in pages.as_json({"a": "</script><!--"})
     with pytest.raises(ValueError, match="JSON"):
-        rendering.as_json({"a": float("nan")})
+        pages.as_json({"a": float("nan")})
 
 
 # Comparisons and other studies
@@ -422,15 +417,15 @@ def compared():
 
 @pytest.fixture(scope="module")
 def compared_motions(compared):
-    return comparison_motions.of_comparison(compared)
+    return comparison.of_comparison(compared)
 
 
 def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
     compared, compared_motions, tmp_path
 ):
     Image.new("RGB", (1700, 900), "white").save(tmp_path / comparison_report.FIGURE)
-    compare_page.write(tmp_path, compared)
-    page = Page(tmp_path / rendering.PAGE)
+    comparison_report.write_page(tmp_path, compared)
+    page = Page(tmp_path / pages.PAGE)
     assert page.text.startswith(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
         "1 of 2 beyond a limit ◐ Worst is deep: its standing feet are 2 cm or more off the "
@@ -462,9 +457,9 @@ def test_where_feet_are_furthest_off_is_the_worst_window(compared):
     stance = np.zeros((400, 2), bool)
     height = np.repeat(gap[..., None], 2, axis=-1)
     feet = dataclasses.replace(feet, height=height, stance=stance)
-    start, end = comparison_motions.worst_seconds(feet, 60.0)
+    start, end = comparison.worst_seconds(feet, 60.0)
     assert start <= 150 and end >= 159 and end - start == 120
-    assert comparison_motions.worst_seconds(feet, 600.0) == (0, 399)
+    assert comparison.worst_seconds(feet, 600.0) == (0, 399)
 
 
 def test_the_worst_fault_is_named_and_no_system_praised_that_is_worse_than_the_animation(
@@ -474,15 +469,15 @@ def test_the_worst_fault_is_named_and_no_system_praised_that_is_worse_than_the_a
     pop = dataclasses.replace(placed.pop, value=0.0)
     still = dataclasses.replace(placed, sunk=0.0, floating=0.0, slide=-0.01, pop=pop)
     popping = dataclasses.replace(still, pop=dataclasses.replace(placed.pop, value=0.1))
-    excess, words = compare_sentences.faults(popping)[0]
+    excess, words = comparison_report.faults(popping)[0]
     assert excess == pytest.approx(2.0 / placed.size) and words.startswith("its feet pop by up to")
-    assert compare_sentences.beyond({"a": still, "b": popping}) == ["b"]
+    assert comparison_report.beyond({"a": still, "b": popping}) == ["b"]
     unknown = dataclasses.replace(still, sunk=math.nan, groundless=1.0)
-    assert "no ground under 100.0 %" in compare_sentences.faults(unknown)[0].words
+    assert "no ground under 100.0 %" in comparison_report.faults(unknown)[0].words
     accuracy = compared_motions.accuracy
     worse = {**accuracy, "as animated": accuracy["close"]}
     far = dataclasses.replace(compared_motions, accuracy=worse)
-    last = compare_sentences.findings(compared, far)[2]
+    last = comparison_report.findings(compared, far)[2]
     assert last.bad and last.text.startswith("No system comes closer to the captured motion")
 
 
@@ -496,7 +491,7 @@ def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
         sections=[Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")])],
         asked=[["What", HOSTILE]],
     ).write(tmp_path)
-    page = Page(tmp_path / rendering.PAGE)
+    page = Page(tmp_path / pages.PAGE)
     assert "bad ◐ bad <i> good a b good too" in page.text
     assert "<li>good <code>a</code> <strong>b</strong></li>" in page.html
     assert '<td class="miss">2!</td>' in page.html and page.elements.count("script") == 2
@@ -506,10 +501,10 @@ def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
 def test_pictures_become_small_enough_and_missing_ones_are_left_out(tmp_path, monkeypatch):
     noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.png")
-    (picture,) = pictures.embed(tmp_path, {"noise.png": "noise", "no.png": "none"})
+    (picture,) = pages.embed(tmp_path, {"noise.png": "noise", "no.png": "none"})
     assert (picture.width, picture.height) == (60, 40)
-    monkeypatch.setattr(pictures, "MAX_BYTES", 1_000)
-    (picture,) = pictures.embed(tmp_path, {"noise.png": "noise"})
+    monkeypatch.setattr(pages, "MAX_BYTES", 1_000)
+    (picture,) = pages.embed(tmp_path, {"noise.png": "noise"})
     assert picture.size <= 1_000 and picture.width < 40
     assert picture.width / picture.height == pytest.approx(1.5, abs=0.2)
 
@@ -522,6 +517,6 @@ def test_runs_that_cannot_be_told_apart_are_said_so():
     ):
         other = ComparedRun("b", -10.0 - behind, 2.0, behind, 1.0, 4.0, unreliable, {1: -9.0})
         runs = [ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}), other]
-        findings = runs_page.findings(runs)
+        findings = run_comparison.findings(runs)
         found = [finding.bad for finding in findings if finding.text.startswith(first)]
         assert len(findings) == 3 and found == [bad], first

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from loky import get_reusable_executor
 
-from fitting.runtime.parallel import beside
+from fitting.runtime import beside
 
 MARK = "JAXIK_TEST_MARK"
 

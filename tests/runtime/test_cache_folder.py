@@ -20,7 +20,6 @@ from fitting.runtime.cache_folder import (
     SwitchedOffError,
     setting,
 )
-from fitting.runtime.storage import compiled_programs
 
 DIGEST = "0123456789abcdef" * 4
 
@@ -56,7 +55,7 @@ def test_programs_are_kept_where_the_platform_or_the_environment_says(tmp_path, 
 
 def test_the_default_folder_is_made_and_private_unless_the_user_has_chosen(caches, monkeypatch):
     called = []
-    monkeypatch.setattr(compiled_programs, "write_complete_files", lambda: called.append(True))
+    monkeypatch.setattr(cache_folder, "write_complete_files", lambda: called.append(True))
     jax.config.update(MIN_SECONDS, 3.0)
     for chosen in ("elsewhere", ""):
         jax.config.update(FOLDER, chosen)

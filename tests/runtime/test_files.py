@@ -14,11 +14,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from fitting.runtime import files
-from fitting.runtime.storage import claimed_folder
-from fitting.runtime.storage.claimed_folder import LOCK, claimed
-from fitting.runtime.storage.declared_types import Finite, between, checked, length
-from fitting.runtime.storage.json_files import JsonFile
+from fitting.runtime import claimed_folder, files
+from fitting.runtime.claimed_folder import LOCK, claimed
+from fitting.runtime.json_files import Finite, JsonFile, between, checked, length
 
 
 def names(folder):
@@ -156,7 +154,7 @@ def test_what_0_1_0_was_writing_goes_when_the_same_file_is_written_again(tmp_pat
 HOLD = """
 import sys, time
 from pathlib import Path
-from fitting.runtime.storage.claimed_folder import claimed
+from fitting.runtime.claimed_folder import claimed
 
 with claimed(Path(sys.argv[1])):
     print("claimed", flush=True)

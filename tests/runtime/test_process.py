@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from fitting.cli import jax_start
-from fitting.runtime import allocator, threads, xla
-from fitting.runtime.parallel import cluster, effort
+from fitting.runtime import cluster, threads, xla
 from fitting.runtime.precision import for_other_thread, in_float64, with_floats
 from support.experiments import ROOT
 
@@ -34,7 +33,7 @@ FAULTS = """
 import resource
 import numpy as np
 from fitting.cli import jax_start
-from fitting.runtime import allocator
+from fitting.runtime import xla as allocator
 allocator.keep_freed_memory()
 np.ones(4 << 20, np.float32)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -127,12 +126,12 @@ def test_a_loop_that_moves_little_becomes_one_function():
         assert ("xla_cpu_small_call" in program) == one_function, numbers
 
 
-@pytest.mark.skipif(not allocator.keep_freed_memory(), reason="needs the GNU C library")
+@pytest.mark.skipif(not xla.keep_freed_memory(), reason="needs the GNU C library")
 def test_arrays_reuse_the_memory_of_those_that_were_freed_unless_the_user_set_it(monkeypatch):
-    for name in allocator.OF_USER:
+    for name in xla.OF_USER:
         with monkeypatch.context() as patch:
             patch.setenv(name, "")
-            assert not allocator.keep_freed_memory(), name
+            assert not xla.keep_freed_memory(), name
     pages = 4 * (4 << 20) // 4096
     small = {"NUMPY_MADVISE_HUGEPAGE": "0"}  # pages
     assert int(printed(FAULTS, **small)) < 2 * pages
@@ -347,7 +346,7 @@ def test_a_cluster_that_cannot_be_is_refused_and_none_is_this_process(monkeypatc
 def test_the_peak_of_a_process_does_not_begin_with_that_of_its_parent():
     # Of resident memory: what the parent has touched counts.
     taken = b"1" * 600_000_000
-    words = "from fitting.runtime.parallel.effort import peak_mb; print(peak_mb())"
-    own = effort.peak_mb()
+    words = "from fitting.runtime.cluster import peak_mb; print(peak_mb())"
+    own = cluster.peak_mb()
     assert own is not None and own > len(taken) / 1e6
     assert 1.0 < float(printed(words, **os.environ)) < 300.0

@@ -17,10 +17,9 @@ import pytest
 from jax._src import compilation_cache
 from jax._src.lru_cache import LRUCache
 
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import make_problem
-from fitting.runtime import activity, cache_folder, files, program_cache, program_key
-from fitting.runtime.storage import compiled_programs
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import make_problem
+from fitting.runtime import activity, cache_folder, files, program_cache
 from jaxik.maths import vec
 from support.experiments import ROOT, write
 
@@ -148,10 +147,10 @@ IN_ANOTHER_PROCESS = """
 import json, sys
 import jax, jax.numpy as jnp
 jax.config.update("jax_compilation_cache_dir", sys.argv[1])
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import make_problem
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import make_problem
 from fitting.runtime import program_cache
-from fitting.runtime.program_key import program_key
+from fitting.runtime.program_cache import program_key
 from jaxik.maths import vec
 kept = program_cache.cached(vec.sum_last)(jnp.arange(6.0).reshape(2, 3))
 problem = make_problem(load_experiment(sys.argv[2]))
@@ -173,7 +172,7 @@ def test_another_process_has_the_same_keys_and_its_programs_are_not_traced_again
     )  # fmt: skip
     output, key = json.loads(done.stdout)
     problem = make_problem(load_experiment(experiment))
-    assert key == program_key.program_key(make_problem, ((problem,), {}))
+    assert key == program_cache.program_key(make_problem, ((problem,), {}))
     monkeypatch.setattr(program_cache, "_trace", None)
     numbers = jnp.arange(6.0).reshape(2, 3)
     assert program_cache.cached(vec.sum_last)(numbers).tolist() == output == [3.0, 12.0]
@@ -309,7 +308,7 @@ NAME = f"{KEY}-cache"
 
 
 def test_jax_writes_whole_files_or_none_unless_it_locks_their_folder(tmp_path, monkeypatch):
-    compiled_programs.write_complete_files()
+    cache_folder.write_complete_files()
     bounded = LRUCache(str(tmp_path / "bounded"), max_size=1000)  # left to JAX
     bounded.put(KEY, PROGRAM)
     assert bounded.get(KEY) == PROGRAM and f"{KEY}-atime" in os.listdir(tmp_path / "bounded")
@@ -339,7 +338,7 @@ def test_a_damaged_program_is_compiled_once_more_and_replaced(tmp_path):
         assert jax.jit(lambda x: x + 1)(1.0) == 2.0
 
     before = cache_folder.setting(cache_folder.FOLDER)
-    compiled_programs.write_complete_files()
+    cache_folder.write_complete_files()
     jax.config.update(cache_folder.FOLDER, str(tmp_path))
     compilation_cache.reset_cache()
     try:

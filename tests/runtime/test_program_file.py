@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from jax import export
 
-from fitting.runtime import files, plain_tree, program_file, program_key
+from fitting.runtime import files, plain_tree, program_cache
 from fitting.runtime.plain_tree import NotPlainError, describe, rebuild
-from fitting.runtime.program_file import MAGIC, Program, Slot
+from fitting.runtime.program_cache import MAGIC, Program, Slot
 
 # Trees
 
@@ -110,14 +110,14 @@ HOSTILE = [
     ["object", "pathlib:Path", {}],
     ["object", "fitting.runtime.files:os.system", {}],
     ["object", "fitting.runtime.files:write_text", {}],
-    ["object", "fitting.runtime.program_file:Path", {}],
-    ["object", "fitting.runtime.program_file:Slot", {"index": 1, "__class__": 2}],
-    ["object", "fitting.runtime.program_file:Slot", {}],
+    ["object", "fitting.runtime.program_cache:Path", {}],
+    ["object", "fitting.runtime.program_cache:Slot", {"index": 1, "__class__": 2}],
+    ["object", "fitting.runtime.program_cache:Slot", {}],
     ["object", "fitting.never.imported:Class", {}],
     ["object", "equinox:filter_jit", {}],
     ["object", "jax.numpy:ndarray", {}],
-    ["namedtuple", "fitting.runtime.program_file:Slot", 1],
-    ["namedtuple", "fitting.runtime.program_key:ArrayType", 1],
+    ["namedtuple", "fitting.runtime.program_cache:Slot", 1],
+    ["namedtuple", "fitting.runtime.program_cache:ArrayType", 1],
     ["name", "os:system"],
     ["call", "os:system", "true"],
     ["object", 3, {}],
@@ -137,14 +137,14 @@ def test_a_description_reaches_nothing_but_fields_of_known_classes(description):
 
 
 def key(*args, **named):
-    return program_key.program_key(files.write, (args, named))
+    return program_cache.program_key(files.write, (args, named))
 
 
 def test_whatever_changes_a_program_changes_its_key_sources_and_versions_too(monkeypatch):
     x = jnp.ones((2, 3))
     keys = [key(x), key(x[None]), key(x.astype("float32")), key(jnp.asarray(1.0)), key(1.0)]
     keys += [key(x, None), key(None, x), key(x, by=1), key(x, by=True)]
-    keys += [program_key.program_key(files.write_text, ((x,), {}))]
+    keys += [program_cache.program_key(files.write_text, ((x,), {}))]
     with jax.default_matmul_precision("float32"):
         keys.append(key(x))
     with jax.enable_x64(False):
@@ -158,14 +158,14 @@ def test_whatever_changes_a_program_changes_its_key_sources_and_versions_too(mon
     monkeypatch.setattr(closure, "__module__", "fitting.somewhere")
     for function in (key, local(), closure):  # of a user, and what its source does not tell
         with pytest.raises(NotPlainError, match="no named function of this project"):
-            program_key.program_key(function, ((), {}))
-    before, both = key(1), program_key.sources()
+            program_cache.program_key(function, ((), {}))
+    before, both = key(1), program_cache.sources()
     for part, changed in {"versions": {"jax": "1.2.3"}, "sources": "changed"}.items():
         with monkeypatch.context() as patch:
-            patch.setattr(program_key, part, lambda changed=changed: changed)
+            patch.setattr(program_cache, part, lambda changed=changed: changed)
             assert key(1) != before, part
     monkeypatch.setattr(plain_tree, "PROJECT", ("jaxik",))
-    assert program_key.sources.__wrapped__() != both
+    assert program_cache.sources.__wrapped__() != both
 
 
 # Files
@@ -178,12 +178,12 @@ def file(tmp_path):
     vector = jax.ShapeDtypeStruct((3,), float)
     exported = export.export(jax.jit(lambda x: [jnp.sin(x)]))(vector)
     path = tmp_path / "program"
-    program_file.write(path, Program(exported, {"sine": Slot(0), "name": "wave"}), KEY, VERSIONS)
+    program_cache.write(path, Program(exported, {"sine": Slot(0), "name": "wave"}), KEY, VERSIONS)
     return path
 
 
 def read(file):
-    return program_file.read(file, KEY, VERSIONS)
+    return program_cache.read(file, KEY, VERSIONS)
 
 
 def test_a_program_is_read_back_its_header_is_plain_and_no_file_is_no_program(file):
@@ -194,7 +194,7 @@ def test_a_program_is_read_back_its_header_is_plain_and_no_file_is_no_program(fi
     assert output == {"name": "wave"}
     magic, header, body = file.read_bytes().split(b"\n", 2)
     assert magic == b"jaxik program 1"
-    sine = ["object", "fitting.runtime.program_file:Slot", {"index": 0}]
+    sine = ["object", "fitting.runtime.program_cache:Slot", {"index": 0}]
     assert json.loads(header) == {
         "key": KEY,
         "versions": VERSIONS,
@@ -210,7 +210,7 @@ def test_a_file_that_is_cut_off_anywhere_or_of_another_program_is_refused(file):
         (KEY, {"jax": "1.2.4"}, "versions is .*1.2.3"),
     ):
         with pytest.raises(ValueError, match=f"{file} is damaged: its {message}"):
-            program_file.read(file, key, versions)
+            program_cache.read(file, key, versions)
     whole = file.read_bytes()
     header_end = whole.index(b"\n", len(MAGIC)) + 1
     for length in (0, 1, len(MAGIC), header_end - 1, header_end, len(whole) // 2, len(whole) - 1):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets import clip_frames, flat_animation
-from fitting.datasets.terrain import mesh_files
-from fitting.studies.animations import Animation
+from fitting.clips import clip_frames
+from fitting.ground import meshes
+from fitting.motion import flat_animation
+from fitting.studies.animations.animations import Animation
 from jaxik.maths import parameter_tree
 from support.benchmark import scoring_program
 
@@ -27,7 +28,7 @@ CALIBRATION = 1.26  # cm, error of the terrain itself under the stances of 03_03
 def test_the_preset_meets_the_benchmark_on_the_clip_it_was_developed_on(
     mocap, file, as_animated, bounds
 ):
-    path, ground = mocap / "blocks" / file, mesh_files.load_terrain(mocap / "blocks/terrain.ply")
+    path, ground = mocap / "blocks" / file, meshes.load_terrain(mocap / "blocks/terrain.ply")
     # Both animations have the captured pelvis' way and turns, which hold what the blocks did.
     captured = {"pelvis.shift": 0.0, "lean.pelvis_rate": 0.0}
     values = captured | {"probe.swing_as_animated": as_animated}

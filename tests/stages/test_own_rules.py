@@ -17,9 +17,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
-from fitting.datasets.clips import contacts, edit
-from fitting.datasets.synthetic import walker
+from fitting.clips import contacts, edit
+from fitting.clips.clip_frames import clip_from_result, frames_from_clip
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree, quat
 from jaxik.maths.gate import HARD
 from jaxik.stages.inputs import Inputs, SensedMoment

@@ -11,8 +11,8 @@ import pytest
 
 import fitting
 import jaxik
-from fitting.datasets import ground_path
-from fitting.datasets.synthetic import walker
+from fitting.ground import ground_path
+from fitting.synthetic import walker
 from jaxik.pipeline.phases import sense_first
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.root import AbstractRoot, GroundRoot, KeepRoot

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.experiments import experiment_files, known_values, parameter_files, problems, systems
-from fitting.experiments.ablations import Ablation
+from fitting.experiment import experiment_files, parameter_files, problems, systems
+from fitting.experiment.file_tables import Ablation
 from fitting.studies import translation
-from fitting.studies.animations import Animation, AnimationFiles
+from fitting.studies.animations.animations import Animation, AnimationFiles
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, leg, pelvis
@@ -114,7 +114,7 @@ def test_the_truth_of_an_experiment_is_read_with_its_rules(tmp_path):
     (tmp_path / "truth.toml").write_text("[pelvis]\nspeed = 3.5\n")
     clip = "truth = 'truth.toml'"
     read = experiment_files.load_experiment(write(tmp_path, top=RULES, free=FREE, clip=clip))
-    assert known_values.load_known_values(read) == {"pelvis.speed": 3.5}
+    assert problems.load_known_values(read) == {"pelvis.speed": 3.5}
 
 
 def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):

@@ -10,21 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.analysis.accuracy import Accuracy
 from fitting.cli import main
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.experiments import problems
-from fitting.experiments.ablations import COMPLETE, Ablation
-from fitting.experiments.experiment import Experiment
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import ClipData
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.optimisation.solution import Progress, Solution
-from fitting.report import ablation_report
-from fitting.report.labels import ACCURACY
-from fitting.report.page import rendering
-from fitting.report.page.studies import ablation_page
-from fitting.report.plots import ablation_plots
+from fitting.clips import load_clip, save_clip
+from fitting.experiment import problems
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.file_tables import COMPLETE, Ablation
+from fitting.experiment.problems import ClipData
+from fitting.inference.noise import NoiseOptions
+from fitting.inference.optimise.solution import Progress, Solution
+from fitting.motion.accuracy import Accuracy
+from fitting.report import pages
+from fitting.report.formatting import ACCURACY
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
 from jaxik.maths import parameter_tree
@@ -140,7 +137,7 @@ def test_an_impossible_variant_is_reported_by_name_before_any_fit(tmp_path, sear
     rest = '[[without]]\nname = "high"\nparameters = { contact.planted_height = 9.0 }\n'
     experiment = load(tmp_path, rest, free="contact.raised_height = {}")
     with pytest.raises(ValueError, match="high: .*contact.raised_height stays above"):
-        ablation.ablate(experiment, tmp_path / "out")
+        ablation.fit_variants(experiment, tmp_path / "out")
     assert not search.calls
 
 
@@ -150,7 +147,7 @@ def test_an_impossible_variant_is_reported_by_name_before_any_fit(tmp_path, sear
 def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tmp_path, search):
     rest = WITHOUT + '[sigmas]\nankle = 0.05\n[noise]\nsigmas = "estimated"\n'
     experiment = load(tmp_path, rest, top='fps = 15.0\nloss = "squares"\nholdout = 0.0')
-    rows = ablation.ablate(experiment, tmp_path / "out")
+    rows = ablation.fit_variants(experiment, tmp_path / "out")
     names = [(row.variant, row.part) for row in rows]
     assert names == [(name, part) for name in (ALL, PITCH, BOTH) for part in (1, 2, 0)]
     assert [list(row.values) for row in rows[::3]] == [
@@ -184,7 +181,7 @@ def test_without_a_folder_nothing_is_written_and_progress_says_what_is_fitted(
     experiment, stages = load(tmp_path), []
     before = set(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
-    rows = ablation.ablate(experiment, progress=lambda report: stages.append(report.stage))
+    rows = ablation.fit_variants(experiment, progress=lambda report: stages.append(report.stage))
     assert len(rows) == 9 and set(tmp_path.iterdir()) == before
     assert stages[0] == "all rules, part 1 of 2: polish"
     assert stages[-1] == "pitch, everything: polish"
@@ -198,7 +195,9 @@ def test_only_changed_variants_are_fitted_again(tmp_path, search, monkeypatch):
     monkeypatch.setattr(ablation.jax, "clear_caches", lambda: clearings.append(len(new)))
 
     def ablate(rest: str = WITHOUT, top: str = "", folds: int = 2) -> list[Row]:
-        return ablation.ablate(load(tmp_path, rest, top=top), out, folds=folds, on_row=new.append)
+        return ablation.fit_variants(
+            load(tmp_path, rest, top=top), out, folds=folds, on_row=new.append
+        )
 
     first = ablate()
     assert new == first and len(search.calls) == 6
@@ -224,10 +223,10 @@ def test_a_changed_clip_is_fitted_again(tmp_path, search):
     clip = load_clip(paths[0])
     save_clip(tmp_path / "walk.npz", clip)
     clips = SIX_SECONDS.replace(paths[0], "walk.npz")
-    ablation.ablate(load(tmp_path, "", clips=clips), tmp_path / "out")
+    ablation.fit_variants(load(tmp_path, "", clips=clips), tmp_path / "out")
     moved = clip.with_motion(clip.positions_ws + [0.0, 0.001, 0.0], clip.rotations_ws)
     save_clip(tmp_path / "walk.npz", moved)
-    ablation.ablate(load(tmp_path, "", clips=clips), tmp_path / "out")
+    ablation.fit_variants(load(tmp_path, "", clips=clips), tmp_path / "out")
     assert len(search.calls) == 6
 
 
@@ -247,17 +246,17 @@ ROWS = [
 
 
 def test_a_table_shows_how_much_a_figure_rises_without_a_rule():
-    heading, complete, ablated = ablation_report.group(ROWS, 1)
+    heading, complete, ablated = ablation.group(ROWS, 1)
     ankle = heading.index("ankle, cm")
     assert (complete[0], complete[ankle]) == ("all rules", "3.00")
     assert (ablated[0], ablated[ankle]) == ("without pitch", "4.10 (+1.10)")
-    assert ablation_report.group(ROWS, 2)[2][ankle] == "2.90 (-0.30)"
+    assert ablation.group(ROWS, 2)[2][ankle] == "2.90 (-0.30)"
     slip = heading.index("added slip, mm a frame")
-    assert ablation_report.group(ROWS, 0)[2][slip] == "–"
+    assert ablation.group(ROWS, 0)[2][slip] == "–"
 
 
 def test_all_figures_are_in_the_csv_in_the_units_of_their_columns():
-    lines = list(csv.DictReader(ablation_report.cells(ROWS).splitlines()))
+    lines = list(csv.DictReader(ablation.cells(ROWS).splitlines()))
     assert [(line["variant"], line["held out"]) for line in lines[:3]] == [
         ("all rules", "1"), ("all rules", "2"), ("all rules", "nothing")
     ]  # fmt: skip
@@ -269,18 +268,18 @@ def test_all_figures_are_in_the_csv_in_the_units_of_their_columns():
 
 def test_summary_and_page_show_groups_ablations_and_fits_that_did_not_converge(tmp_path):
     experiment = load(tmp_path)
-    ablation_report.write(tmp_path, experiment, ROWS)
-    text = (tmp_path / ablation_report.TABLE).read_text()
+    ablation.write(tmp_path, experiment, ROWS)
+    text = (tmp_path / ablation.TABLE).read_text()
     assert text.count("\n| without pitch |") == 3 and "Part 1 of 2 held out" in text
     assert "- **pitch**: `foot.max_pitch` = 0.2\n" in text
     assert "| `foot.max_pitch` | 0.4 | – |" in text
     assert "- without pitch, part 2 held out: Far off." in text
     assert all(f"- **{column.heading}** ({column.unit})" in text for column in ACCURACY.values())
-    head = (tmp_path / ablation_report.FIGURE).read_bytes()[:24]
+    head = (tmp_path / ablation.FIGURE).read_bytes()[:24]
     wide, high = struct.unpack(">II", head[16:24])
     assert 1000 < wide < 2000 and 400 < high < 2000
-    ablation_page.write(tmp_path, experiment, ROWS)
-    page = Page(tmp_path / rendering.PAGE)
+    ablation.write_page(tmp_path, experiment, ROWS)
+    page = Page(tmp_path / pages.PAGE)
     assert "2 fits not converged ◐ 2 of 6 fits did not converge" in page.text
     assert "3.10 cm from the captured ones (rms) on parts that were held out, 2.50 cm" in page.text
     assert "Not converged: without pitch, part 2 held out: Far off." in page.text
@@ -294,12 +293,12 @@ def test_the_page_says_what_a_rule_is_worth_where_it_was_not_fitted():
         (0.025, 0.031, "No rule is needed: without any one", True),
     ):
         held_out = [row(PITCH, 1, ankle=first), row(PITCH, 2, ankle=second)]
-        _, rule, _ = ablation_page.findings([*ROWS[:3], *held_out, row(PITCH, 0)])
+        _, rule, _ = ablation.findings([*ROWS[:3], *held_out, row(PITCH, 0)])
         assert sentence in rule.text and rule.bad is bad
 
 
 def test_the_figure_has_a_bar_per_variant_and_a_point_per_part():
-    figure = ablation_plots.overview(ROWS, "hill")
+    figure = ablation.overview(ROWS, "hill")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     panels = [axes for axes, title in zip(figure.axes, titles, strict=True) if title]
     headings = [title.partition(",")[0].lower() for title in titles if title]

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.analysis import measures, placement
-from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
-from fitting.datasets.clips import Clip, edit, load_clip, save_clip
-from fitting.datasets.ground_path import AS_ANIMATED, place_root
-from fitting.datasets.synthetic import walker
-from fitting.datasets.terrain.mesh_files import save_mesh
-from fitting.experiments import parameter_files, systems
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import make_problem
+from fitting.clips import Clip, edit, load_clip, save_clip
+from fitting.clips.clip_frames import clip_from_result, frames_from_clip
+from fitting.experiment import parameter_files, systems
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import make_problem
+from fitting.ground.ground_path import AS_ANIMATED, place_root
+from fitting.ground.meshes import save_mesh
+from fitting.motion import measures
 from fitting.runtime import program_cache
-from fitting.studies.animations import Animation
+from fitting.studies.animations.animations import Animation
+from fitting.synthetic import walker
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs, Moment
@@ -90,7 +90,7 @@ def test_with_ozz_soles_are_on_a_flat_floor_untouched(walk):
     for name, make in BODIES.items():
         other = make(walk)
         result = run(presets.ozz(other.rig), other.rig, FLOOR, frames_from_clip(other))
-        soles = measures.soles(clip_from_result(other, result))
+        soles = measures.sole_points(clip_from_result(other, result))
         lowest = soles[..., 1].min(axis=-1)[other.stance_labels()]
         assert np.abs(lowest).max() < 0.005, name
 
@@ -121,8 +121,8 @@ def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
     for size in (1.0, 0.5, 3.0):
         clip = scaled(walk, size)
         lowered = clip.with_motion(clip.positions_ws - [0.0, 0.03 * size, 0.0], clip.rotations_ws)
-        feet = placement.soles(lowered, clip, FLOOR)
-        assessed = placement.assess(feet, lowered, clip)
+        feet = measures.soles(lowered, clip, FLOOR)
+        assessed = measures.assess(feet, lowered, clip)
         assert assessed.misplaced and assessed.visible == pytest.approx(0.02 * size, rel=0.02)
         shares.append(assessed.sunk)
     np.testing.assert_allclose(shares, shares[0])

@@ -17,18 +17,16 @@ from distributed import LocalCluster
 
 import fitting
 from fitting.cli import main
-from fitting.experiments import problems
-from fitting.experiments.experiment import Experiment
-from fitting.experiments.experiment_files import load_experiment
-from fitting.inference.noise.model import noise_of
+from fitting.experiment import problems
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.inference.noise import noise_of
 from fitting.inference.profiles.profile import make_profile
 from fitting.problem.problem import Problem
-from fitting.report.calibration import calibration_report, calibration_tables
-from fitting.report.page import rendering
-from fitting.report.plots import calibration_plots
-from fitting.studies.calibration import calibration, replicates
-from fitting.studies.calibration.assessment import Assessment, assess, summarise
-from fitting.studies.calibration.calibration import Calibration, CalibrationProgress, Observers
+from fitting.report import pages
+from fitting.studies.calibrate import calibration, calibration_report, replicates
+from fitting.studies.calibrate.assessment import Assessment, assess, summarise
+from fitting.studies.calibrate.calibration import Calibration, CalibrationProgress, Observers
 from support import small_studies
 from support.experiments import ROOT
 from support.pages import Page
@@ -158,7 +156,7 @@ def test_recovery_counts_determined_parameters_within_5_percent_of_their_range(m
     assessment = assess(Calibration(fits, []))
     assert (assessment.recovery.hits, assessment.recovery.total) == (1, 2)
     assert assessment.recovery_of["foot.max_pitch"].total == 0
-    assert "0 of 0" in str(calibration_tables.parameter_table(assessment))
+    assert "0 of 0" in str(calibration_report.parameter_table(assessment))
 
 
 def test_ranks_are_uniform_however_many_draws_a_chain_has():
@@ -292,7 +290,7 @@ def test_the_folder_has_a_report(finished):
     assert summary.startswith(f"# hill: calibration\n\n{everything}")
     for picture in ("ranks.png", "recovery.png"):
         assert f"({picture})" in summary and (out / picture).stat().st_size > 10_000
-    page = Page(out / rendering.PAGE)
+    page = Page(out / pages.PAGE)
     assert f"but {COUNT} simulated motions prove little, as these bounds are wide" in page.text
     assert page.elements.count("img") == 2 and "h2 Ranks" in page.headings
     numbers = json.loads((out / "calibration.json").read_text())
@@ -310,7 +308,7 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
     assert "Not calibrated: on 8 simulated motions, outside their bounds: the fit's 95 %" in printed
     assert "**no**, too few" in printed
     assert not (out / "ranks.png").exists(), "there are no chains"
-    page = Page(out / rendering.PAGE)
+    page = Page(out / pages.PAGE)
     assert "hill Not calibrated ◐ Of 8 simulated motions, outside their bounds: the" in page.text
     assert "No posterior was sampled" in page.text and "no, too few" in page.text
 
@@ -318,7 +316,7 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
 def test_the_picture_marks_ranks_that_leave_their_band(finished):
     ranks = finished.assessment.ranks
     wrong = dataclasses.replace(ranks["pelvis.on_gain"], ranks=np.zeros(40, int))
-    figure = calibration_plots.ranks({**ranks, "foot.max_pitch": wrong}, "title")
+    figure = calibration_report.ranks({**ranks, "foot.max_pitch": wrong}, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:6] == [
         "pelvis.on_gain", "", "foot.max_pitch", "outside its band", "log-probability", ""

@@ -10,15 +10,14 @@ import pytest
 import trimesh
 
 from fitting.cli import main
-from fitting.datasets.clips import Clip, save_clip
-from fitting.datasets.flat_animation import flatten_clip
-from fitting.datasets.relief import relief
-from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import ClipData
-from fitting.report.page import rendering
-from fitting.studies import run_folder
-from fitting.studies.motions import capture_check
+from fitting.clips import Clip, save_clip
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import ClipData
+from fitting.ground.coverage import relief
+from fitting.ground.meshes import load_terrain
+from fitting.motion.flat_animation import flatten_clip
+from fitting.report import pages
+from fitting.studies.fit import capture_check, run_folder
 from support.experiments import write
 from support.sample_clips import flat_floor, stair_walk
 from support.small_studies import HALF_SECOND
@@ -115,6 +114,6 @@ def test_where_nothing_is_free_the_system_is_judged_as_it_comes(tmp_path, capsys
     assert "Does not fit: " in text and "Nothing is free: this is the system as it comes." in text
     numbers = json.loads((run / run_folder.FIT).read_text())
     assert numbers["parameters"] == [] and numbers["distances"]["kept"] == "fitted"
-    assert (run / rendering.PAGE).exists() and (run / run_folder.PARAMETERS).exists()
+    assert (run / pages.PAGE).exists() and (run / run_folder.PARAMETERS).exists()
     assert main.main(["sample", str(run)]) == 2
     assert "nothing was free" in capsys.readouterr().err

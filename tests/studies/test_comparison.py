@@ -11,25 +11,23 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from fitting.analysis import measures
-from fitting.analysis.measures import Measures
-from fitting.analysis.playback import Motion
+from fitting import clips
 from fitting.cli import main
 from fitting.cli.parser import make_parser
-from fitting.datasets import clips
-from fitting.datasets.clips import edit
-from fitting.datasets.flat_animation import load_flat_animation
-from fitting.datasets.synthetic import walker
-from fitting.datasets.synthetic.walker import WalkStyle
-from fitting.datasets.terrain import mesh_files
-from fitting.experiments.systems import preset_system
-from fitting.report import comparison_report
-from fitting.report.labels import MEASURES
-from fitting.report.page import rendering
-from fitting.report.plots import comparison_plots, style
-from fitting.studies import comparison, frame_rates
-from fitting.studies.animations import Animation
-from fitting.studies.frame_rates import every_frame, measure
+from fitting.clips import edit
+from fitting.experiment.systems import preset_system
+from fitting.ground import meshes
+from fitting.motion import measures
+from fitting.motion.flat_animation import load_flat_animation
+from fitting.motion.measures import Measures
+from fitting.motion.playback import Motion
+from fitting.report import pages, style
+from fitting.report.formatting import MEASURES
+from fitting.studies.animations import animations
+from fitting.studies.animations.animations import Animation, every_frame, measure
+from fitting.studies.compare import comparison, comparison_report
+from fitting.synthetic import walker
+from fitting.synthetic.walker import WalkStyle
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support import comparisons
@@ -37,7 +35,9 @@ from support.commands import refusal
 from support.experiments import ROOT
 from support.pages import Page
 
-pytestmark = pytest.mark.filterwarnings("always::fitting.report.placement_report.PlacementWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "always::fitting.studies.animations.placement_report.PlacementWarning"
+)
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
@@ -166,7 +166,7 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
 def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
     folder = compared.folder
     table, figure = folder / comparison_report.TABLE, folder / comparison_report.FIGURE
-    page, files = folder / rendering.PAGE, {path.name for path in folder.iterdir()}
+    page, files = folder / pages.PAGE, {path.name for path in folder.iterdir()}
     assert files == {page.name, table.name, figure.name, comparison_report.NUMBERS}
     (clip,) = Page(page).data["clips"]
     labels = [skeleton["label"] for skeleton in clip["skeletons"]]
@@ -194,7 +194,7 @@ def test_the_terminal_shows_the_table_and_warnings(compared):
 
 def test_a_figure_distinguishes_more_systems_than_there_are_colours():
     names = [f"system {index}" for index in range(15)]
-    styles = comparison_plots._line_styles(names)
+    styles = comparison_report._line_styles(names)
     assert len({(style_["color"], style_["linestyle"]) for style_ in styles.values()}) == len(names)
     assert styles["system 0"]["color"] == style.BEFORE
 
@@ -209,7 +209,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
         motions=dict.fromkeys(compared.motions, motion),
         measures={**compared.measures, comparison.ANIMATED: unknown},
     )
-    figure = comparison_plots.overview(compared)
+    figure = comparison_report.overview(compared)
     upper, lower = figure.subfigs
     assert len(upper.axes) == 2 * (2 + 1) and len(lower.axes) == len(MEASURES)
     assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00", "0.00"]
@@ -241,7 +241,7 @@ def test_presets_that_leave_heights_to_their_game_stand_on_the_ground_by_default
 def fast() -> Animation:
     """A walk at 120 Hz over the first terraces."""
     clip = walker.walk(3.0, 120.0, 6, (), WalkStyle(knees=1.0))
-    return Animation(clip, mesh_files.load_terrain(TERRACES))
+    return Animation(clip, meshes.load_terrain(TERRACES))
 
 
 def raised_by_frame_time(animation, ik):
@@ -282,11 +282,11 @@ def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path
     assert row in " ".join(capsys.readouterr().out.split())
     text = (tmp_path / "out" / comparison_report.TABLE).read_text()
     assert "## At other frame rates" in text
-    assert "h2 At other frame rates" in Page(tmp_path / "out" / rendering.PAGE).headings
+    assert "h2 At other frame rates" in Page(tmp_path / "out" / pages.PAGE).headings
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
     half, quarter = json.loads((tmp_path / "out/compare.json").read_text())["rates"]
     assert (half["system"], half["fps"], quarter["fps"]) == ("ozz", 60.0, 30.0)
-    for joint in frame_rates.JOINTS:
+    for joint in animations.JOINTS:
         assert half["rms"][joint] == pytest.approx(10 / 60 - 10 / 120)
         assert half["largest"][joint] == pytest.approx(10 / 60 - 10 / 120)
         assert quarter["rms"][joint] == pytest.approx(10 / 30 - 10 / 120)

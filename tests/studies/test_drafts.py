@@ -14,18 +14,16 @@ import trimesh
 
 from fitting import jobs
 from fitting.cli import main
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.experiments import experiment_files, problems
-from fitting.experiments.experiment import DEFAULT_SIGMAS, ClipEntry
-from fitting.experiments.problems import load_clip_data
-from fitting.experiments.schema.experiment_schema import experiment_schema
-from fitting.experiments.systems import Preset
-from fitting.inference import choice, sensitivity
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.problem.free_parameters import free_parameter
-from fitting.problem.prior import SPREAD
-from fitting.problem.space import make_space
-from fitting.studies.drafts import assumptions, draft
+from fitting.clips import load_clip, save_clip
+from fitting.experiment import experiment_files, problems
+from fitting.experiment.experiment import DEFAULT_SIGMAS, ClipEntry
+from fitting.experiment.problems import load_clip_data
+from fitting.experiment.schema import experiment_schema
+from fitting.experiment.systems import Preset
+from fitting.inference import sensitivity
+from fitting.inference.noise import NoiseOptions
+from fitting.problem.space import SPREAD, free_parameter, make_space
+from fitting.studies.drafts import draft
 from fitting.studies.drafts.draft import DraftRequest
 from jaxik.maths import parameter_tree
 from support import quick
@@ -39,7 +37,7 @@ GROUND = ROOT / "data/terrains/uneven_walk.ply"
 
 def choose_few(ik, candidates, scenes):
     """A forecast that needs no pipeline."""
-    return [choice.Forecast(name, name == "pelvis.limit", 1.0, 0.9) for name in candidates]
+    return [sensitivity.Forecast(name, name == "pelvis.limit", 1.0, 0.9) for name in candidates]
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +124,7 @@ def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monke
 
 def test_of_two_parameters_that_do_the_same_only_one_is_free():
     slopes = np.array([[1.0, 2.0, 0.0], [1.0, 2.0, 1e-3], [0.0, 0.0, 3.0], [0.0, 0.01, 0.0]])
-    free, rivals = choice._narrowed_down(slopes @ slopes.T)
+    free, rivals = sensitivity._narrowed_down(slopes @ slopes.T)
     assert 2 in free and 3 not in free
     assert len({0, 1} & set(free)) == 1
     (left_out,) = {0, 1} - set(free)
@@ -171,7 +169,7 @@ def slopes(ik, free, scenes) -> dict[str, tuple[float, float]]:
 
 def test_what_moves_the_clip_is_expected_to_be_determined(candidates):
     ik, free, scenes = candidates
-    forecasts = {forecast.name: forecast for forecast in choice.choose_free(ik, free, scenes)}
+    forecasts = {forecast.name: forecast for forecast in sensitivity.choose_free(ik, free, scenes)}
     for name, (reach, squared_slope) in slopes(ik, free, scenes).items():
         information = (1 / 30) / 0.5 * squared_slope  # residuals of half a second tell one thing
         contraction = 1 - 1 / (1 + SPREAD**2 * information)
@@ -201,7 +199,7 @@ def test_ground_of_another_clip_is_doubted():
     advice = [
         assumption.advice
         for each in (data, other)
-        for assumption in assumptions.of_clip(each, None, base_is_own=True)
+        for assumption in draft.of_clip(each, None, base_is_own=True)
         if assumption.topic == "ground"
     ]
     assert advice == ["", "does this ground belong to this clip?"]
@@ -217,9 +215,7 @@ def test_soles_are_measured_estimated_or_given_and_it_is_said_which():
     ):
         (soles,) = (
             assumption
-            for assumption in assumptions.of_clip(
-                each, None, base_is_own=True, sole_is_given=is_given
-            )
+            for assumption in draft.of_clip(each, None, base_is_own=True, sole_is_given=is_given)
             if assumption.topic == "soles"
         )
         assert words in soles.text and ("--sole" in soles.advice) == is_doubted, soles

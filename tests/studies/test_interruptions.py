@@ -14,16 +14,16 @@ import pytest
 
 import fitting
 from fitting.cli import main
-from fitting.experiments.experiment_files import load_experiment
+from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.profiles import profiling
-from fitting.jobs import fits
-from fitting.runtime.storage.claimed_folder import LOCK, claimed
-from fitting.studies import ablation, assess, run_folder
-from fitting.studies.calibration import replicates
-from fitting.studies.fit import Fit
-from fitting.studies.hierarchy import kept_searches
-from fitting.studies.many import rows, table
-from fitting.studies.many.tasks import plan
+from fitting.runtime.claimed_folder import LOCK, claimed
+from fitting.studies import ablation
+from fitting.studies.calibrate import replicates
+from fitting.studies.fit import assess, fit_jobs, run_folder
+from fitting.studies.fit.fit import Fit
+from fitting.studies.many import many_tasks
+from fitting.studies.many.many_tasks import plan
+from fitting.studies.population import kept_searches
 from support import runs, small_studies
 from support.experiments import ROOT, write
 from support.small_studies import HALF_SECOND, ONE_START, TWO_HALF_SECONDS, kept
@@ -79,7 +79,7 @@ STUDIES = {
     "fit-many": Study(
         small_studies.quick_many,
         "--workers 0 --no-reports",
-        [Stop(fits, SEARCH, 2, "runs/**/row.json", 1)],
+        [Stop(fit_jobs, SEARCH, 2, "runs/**/row.json", 1)],
         1,
         "runs/**/search.json",
     ),
@@ -138,8 +138,8 @@ def experiment_file(tmp_path, monkeypatch) -> Path:
     """Of a fit without a report, which alone needs the pipeline."""
     small_studies.quick_fits(monkeypatch)
     monkeypatch.setattr(Fit, "groups", [])
-    monkeypatch.setattr(fits, "Rehearsal", Mock())
-    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_, **__: None)
+    monkeypatch.setattr(fit_jobs, "Rehearsal", Mock())
+    monkeypatch.setattr(fit_jobs.fit_report, "write_fit", lambda *_, **__: None)
     return write(tmp_path, clips=HALF_SECOND, rest=FEW)
 
 
@@ -171,7 +171,7 @@ def test_a_killed_fit_goes_on_after_its_search_and_after_the_last_stage_of_its_p
         fitting.fit(experiment_file, killed, log=lines.append)
     assert "a fit that was interrupted here goes on after 14 stages of its search" in lines
     whole, rehearsal = killed.parent / "whole", Mock()
-    monkeypatch.setattr(fits, "Rehearsal", rehearsal)
+    monkeypatch.setattr(fit_jobs, "Rehearsal", rehearsal)
     fitting.fit(experiment_file, whole, report=False)
     rehearsal.assert_not_called()  # its motions are for the report
     monkeypatch.setattr(profiling, "STAGES", [kill] * 4 + stages[4:])
@@ -212,7 +212,7 @@ def test_one_ctrl_c_ends_a_command_with_workers_and_the_same_command_goes_on(tmp
     _, second = plan([load_experiment(experiment)])
 
     def whole() -> dict[Path, bytes]:
-        return {path: path.read_bytes() for path in out.glob(f"runs/**/{rows.ROW}")}
+        return {path: path.read_bytes() for path in out.glob(f"runs/**/{many_tasks.ROW}")}
 
     with (
         claimed((out / second.run).with_suffix(".lock")),  # so that it cannot end meanwhile
@@ -233,7 +233,7 @@ def test_one_ctrl_c_ends_a_command_with_workers_and_the_same_command_goes_on(tmp
     text, before = screen.read_text(), whole()
     assert "Finished: 1 of 2 fits" in text and "Traceback" not in text
     assert "the same command makes the fit that is missing" in text
-    assert len((out / table.CSV).read_text().splitlines()) == 1 + len(before) == 2
+    assert len((out / many_tasks.CSV).read_text().splitlines()) == 1 + len(before) == 2
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
     assert done.returncode in (0, 3), done.stderr
     assert "1 are there already" in done.stdout and "http://127.0.0.1:" in done.stdout

@@ -18,18 +18,18 @@ from distributed import LocalCluster
 import fitting
 import jaxik
 from fitting.cli import main
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import make_problem
-from fitting.jobs.many import fits as many_fits
-from fitting.jobs.many import task as task_of_worker
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import make_problem
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
-from fitting.runtime.parallel import first_use
-from fitting.runtime.storage.claimed_folder import claimed
-from fitting.studies import run_folder
-from fitting.studies.many import evaluation, rows, table
-from fitting.studies.many.tasks import plan
+from fitting.runtime import cluster
+from fitting.runtime.claimed_folder import claimed
+from fitting.studies.fit import run_folder
+from fitting.studies.many import evaluation, many_tasks
+from fitting.studies.many import fit_many as many_fits
+from fitting.studies.many import fit_many as task_of_worker
+from fitting.studies.many.many_tasks import plan
 from jaxik.maths import parameter_tree
 from jaxik.world import similarity
 from support import scenes, small_studies
@@ -66,7 +66,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
-    return [table.cells(row) for row in fits.rows]
+    return [many_tasks.cells(row) for row in fits.rows]
 
 
 # What is fitted
@@ -102,7 +102,7 @@ def test_a_fit_is_another_one_if_its_experiment_or_a_file_of_it_changes(experime
 
 
 def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_file, monkeypatch):
-    for kept in list(out.glob(f"runs/**/{rows.ROW}"))[1:]:
+    for kept in list(out.glob(f"runs/**/{many_tasks.ROW}"))[1:]:
         kept.unlink()
 
     def interrupted(client, make, tasks):
@@ -124,10 +124,10 @@ def test_each_fit_is_a_run_and_a_row(finished):
         experiment, summary = run_folder.load_fit(finished.folder / row["run"])
         assert len(experiment.clips) == 1 and experiment.seed == row["seed"]
         assert "outcome" in row and summary["cost"] == row["outcome"]["cost"]
-    present = read(finished.folder / table.CSV)
+    present = read(finished.folder / many_tasks.CSV)
     assert [row["run"] for row in present] == [row["run"] for row in finished.rows]
     assert float(present[0]["pelvis.on_gain"]) == pytest.approx(0.3, abs=0.02)
-    parquet = pyarrow.parquet.read_table(finished.folder / table.PARQUET).to_pylist()
+    parquet = pyarrow.parquet.read_table(finished.folder / many_tasks.PARQUET).to_pylist()
     assert [row["cost"] for row in parquet] == [row["cost"] for row in cells(finished)]
     files = {path.name for path in finished.folder.iterdir()}
     assert {"fits.png", "summary.md", "report.html"} <= files
@@ -135,16 +135,16 @@ def test_each_fit_is_a_run_and_a_row(finished):
 
 def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, monkeypatch):
     lines: list[str] = []
-    (out / finished.rows[0]["run"] / rows.ROW).unlink()
+    (out / finished.rows[0]["run"] / many_tasks.ROW).unlink()
     assert fit_many(experiment_file, out, seeds=2, log=lines.append).made == 1
     assert "4 fits of 1 experiment, 2 seeds for each clip; 3 are there already" in lines
     monkeypatch.setattr(task_of_worker, "fit", None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (out / table.PARQUET).unlink()
+    (out / many_tasks.PARQUET).unlink()
     again = fit_many(experiment_file, out, seeds=2, log=lines.append)
     assert again.rows[1:] == finished.rows[1:] and again.made == 0
     assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
-    assert (out / table.CSV).is_file() and not (out / table.PARQUET).exists()
+    assert (out / many_tasks.CSV).is_file() and not (out / many_tasks.PARQUET).exists()
 
 
 def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
@@ -183,7 +183,7 @@ def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
         patch.setattr(task_of_worker, "fit", fails_first)
         words = ["fit-many", str(experiment_file), "-o", str(out), "--workers", "0"]
         assert main.main([*words, "--no-reports"]) == 6
-    first, second = read(out / table.CSV)
+    first, second = read(out / many_tasks.CSV)
     assert (first["state"], first["error"]) == ("failed", "no luck") and not first["cost"]
     assert second["state"] == "finished" and second["cost"]
     trace = out / first["run"] / task_of_worker.ERROR
@@ -194,8 +194,8 @@ def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
 
 
 def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch):
-    monkeypatch.setattr(first_use.cache_folder, "traced", lambda: tmp_path)
-    monkeypatch.setattr(first_use, "PATIENCE", 0.0)
+    monkeypatch.setattr(cluster.cache_folder, "traced", lambda: tmp_path)
+    monkeypatch.setattr(cluster, "PATIENCE", 0.0)
     key, looks = "0" * 64, []
 
     def look(seconds: float) -> None:
@@ -203,12 +203,12 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
         if len(looks) == 3:
             held.__exit__(None, None, None)
 
-    monkeypatch.setattr(first_use.time, "sleep", look)
+    monkeypatch.setattr(cluster.time, "sleep", look)
     held = claimed(tmp_path / f"first-{key}")
     held.__enter__()
-    with first_use.first_alone(key):
+    with cluster.first_alone(key):
         assert len(looks) == 3
-    with claimed(tmp_path / f"first-{key}"), first_use.first_alone(key):
+    with claimed(tmp_path / f"first-{key}"), cluster.first_alone(key):
         assert len(looks) == 3  # they are kept by now, and nobody waits
 
 
@@ -281,7 +281,7 @@ def calls_of(ik, scenes, systems: int, chunk: int | None, memory: float) -> eval
     """What evaluates so many systems on clips of one length."""
     batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
     mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
-    (stack,) = evaluation.stacking.stack(scenes)
+    (stack,) = evaluation.shared_world.stack(scenes)
     arrays, measure = jax.tree.map(np.asarray, batch), evaluation.errors_and_cost
     return evaluation._Calls(arrays, systems, stack, measure, mesh, chunk, memory)
 

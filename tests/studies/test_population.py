@@ -12,14 +12,13 @@ import pytest
 
 import fitting
 from fitting.cli import main
-from fitting.experiments import parameter_files
-from fitting.experiments.experiment import ClipEntry
-from fitting.experiments.experiment_files import load_experiment
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.report.hierarchy import population_plots, population_report, population_tables
-from fitting.report.page import rendering
-from fitting.studies.hierarchy import kept_searches
-from fitting.studies.hierarchy.population import Population, clip_names
+from fitting.experiment import parameter_files
+from fitting.experiment.experiment import ClipEntry
+from fitting.experiment.experiment_files import load_experiment
+from fitting.inference.noise import NoiseOptions
+from fitting.report import pages
+from fitting.studies.population import kept_searches, population_report
+from fitting.studies.population.population import Population, clip_names
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
@@ -147,7 +146,7 @@ def test_the_folder_has_a_report_and_parameters(made):
     assert summary.startswith("# walks: clips and their population\n\n- `pelvis.on_gain` differs ")
     assert "from 3 clips only." in summary and "A clip that is left out is predicted to" in summary
     assert "(population.png)" in summary and (out / "population.png").stat().st_size > 10_000
-    page = Page(out / rendering.PAGE)
+    page = Page(out / pages.PAGE)
     assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
     assert "All 7 searches and the fit of the population converged." in page.text
     assert page.elements.count("img") == 1 and "uneven_walk from 1 s (ann)" in page.text
@@ -171,7 +170,7 @@ def test_what_has_not_converged_is_said_and_ends_with_status_3(
     path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
     assert main.main(["population", str(path), "-o", str(tmp_path / "out")]) == 3
     assert "**Not converged**: all clips: Not converged: stopped" in capsys.readouterr().out
-    page = Page(tmp_path / "out" / rendering.PAGE)
+    page = Page(tmp_path / "out" / pages.PAGE)
     assert re.search(r"walks \d not converged ◐ \d of the searches did not converge", page.text)
 
 
@@ -190,7 +189,7 @@ def test_the_summary_says_whether_clips_differ_as_far_as_that_is_known(fitted):
 
 
 def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
-    table = population_tables.parameter_table(fitted)
+    table = population_report.parameter_table(fitted)
     assert [row[1] for row in table[1:7]] == [
         "uneven_walk from 0 s (ann)", "uneven_walk from 1 s (ann)", "uneven_walk from 2 s (ben)",
         "pooled", "population", "spread, of u",
@@ -198,10 +197,10 @@ def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
     assert table[1][0] == "`pelvis.on_gain`, 1/tick, per clip" and table[7][1] == "95 % of clips"
     assert table[8][0] == "`foot.max_pitch`, rad, shared" and len(table) == 13
     assert table[8][3] == "" != table[12][3]
-    errors = population_tables.error_table(fitted)
+    errors = population_report.error_table(fitted)
     assert len(errors) == 5 and errors[-1][0] == "all"
     squares = [row.alone**2 for row in fitted.errors]
     assert errors[-1][1] == f"{100 * np.sqrt(np.mean(squares)):.2f}"
-    figure = population_plots.overview(fitted, "title")
+    figure = population_report.overview(fitted, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles == ["pelvis.on_gain", "Error"]

@@ -13,24 +13,23 @@ import pytest
 from jaxtyping import Array
 
 import jaxik
-from fitting.analysis import playback
 from fitting.cli import main
-from fitting.experiments import experiment_files, problems
-from fitting.inference.noise.model import noise_of, with_noise
-from fitting.inference.sampling import blocks
-from fitting.inference.sampling.blocks import BlockLogLikelihood, LeaveOneOut
-from fitting.inference.sampling.posterior import Posterior
+from fitting.experiment import experiment_files, problems
+from fitting.inference.noise import noise_of, with_noise
+from fitting.inference.sample import blocks
+from fitting.inference.sample.blocks import BlockLogLikelihood, LeaveOneOut
+from fitting.inference.sample.posterior import Posterior
+from fitting.motion import playback
 from fitting.problem import residuals, simulation
-from fitting.problem.loss import apply_loss
-from fitting.problem.problem import Problem
+from fitting.problem.problem import Problem, apply_loss
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
-from fitting.report.page import rendering
-from fitting.report.uncertainty import band_plots, predictive
-from fitting.studies import run_folder
-from fitting.studies.posterior import likelihoods
-from fitting.studies.posterior.replay import Replay, replay
-from fitting.studies.posterior.replay_summary import summarise_replay
-from fitting.studies.posterior.run_comparison import compare_runs
+from fitting.report import pages
+from fitting.studies.fit import run_folder
+from fitting.studies.fit.run_folder import summarise_replay
+from fitting.studies.sample import posterior_report
+from fitting.studies.sample import replay as sample_replay
+from fitting.studies.sample.replay import Replay, replay
+from fitting.studies.sample.run_comparison import compare_posteriors
 from support.commands import refusal
 from support.experiments import write
 from support.pages import Page
@@ -67,7 +66,7 @@ def draws_near_the_truth(problem: Problem, draws: int = 60) -> Posterior:
 def half_seconds():
     """Two blocks in a clip of a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(likelihoods, "SECONDS", 0.5)
+        patch.setattr(sample_replay, "SECONDS", 0.5)
         yield
 
 
@@ -91,7 +90,9 @@ def test_a_capture_with_the_assumed_noise_is_like_its_replicates(replayed):
     assert [check.surprises for check in replayed.checks] == [[]] * len(KINDS)
     for check in replayed.checks:
         assert 0.8 < check.rms.median < 1.2
-    assert "is like the posterior's replicates" in predictive.sentence(replayed.checks)
+    assert "is like the posterior's replicates" in posterior_report.predictive_sentence(
+        replayed.checks
+    )
 
 
 def test_other_noise_is_found_out_kind_by_kind(problem):
@@ -108,10 +109,13 @@ def test_an_outlier_is_found_out(problem):
     checks = replay(spoilt, draws_near_the_truth(problem), seed=0).checks
     of_kinds = {check.kind: check.surprises for check in checks}
     assert of_kinds["knee"][-1] == "largest residual" and of_kinds["ankle"] == []
-    text = predictive.sentence(checks)
+    text = posterior_report.predictive_sentence(checks)
     assert text.startswith("The captured motion is unlike") and "knee position" in text
     of_two = [*checks, *(dataclasses.replace(check, clip=1) for check in checks)]
-    assert "knee position of clip 2 (" in predictive.sentence(of_two) and " of clip " not in text
+    assert (
+        "knee position of clip 2 (" in posterior_report.predictive_sentence(of_two)
+        and " of clip " not in text
+    )
     heavy = dataclasses.replace(spoilt, loss="student", tails=jnp.asarray(4.0))
     assert "largest residual" not in surprises(heavy)["knee"]
 
@@ -120,7 +124,7 @@ def test_bands_hold_the_capture_and_are_drawn(replayed):
     channels = ["left, upwards", "left, upwards", "upwards"]
     assert [band.channel for band in replayed.bands[:3]] == channels
     assert all(band.outside < 0.15 for band in replayed.bands)
-    figure = band_plots.bands(replayed.bands, "bands")
+    figure = posterior_report.bands(replayed.bands, "bands")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles[2].startswith("pelvis position, upwards: ") and len(titles) == len(KINDS)
 
@@ -192,7 +196,7 @@ def test_the_digest_is_that_of_the_captured_motion(problem):
     wider = eqx.tree_at(lambda p: p.data[0].sigmas.knee, problem, jnp.asarray(0.5))
     without = eqx.tree_at(lambda p: p.data[0].sigmas.knee, problem, jnp.asarray(np.inf))
     other = eqx.tree_at(lambda p: p.data[0].reference.knee_ws, problem, replace_fn=lambda x: x + 1)
-    digests = [likelihoods.digest(each) for each in (problem, wider, without, other)]
+    digests = [sample_replay.digest(each) for each in (problem, wider, without, other)]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
 
@@ -237,7 +241,7 @@ def write_run(folder: Path, level: np.ndarray, data: str = "aaaa", draws: int = 
 
 
 def test_the_run_that_predicts_better_comes_first_with_the_difference(folder):
-    first, second = compare_runs([Path("a"), Path("b")])
+    first, second = compare_posteriors([Path("a"), Path("b")])
     assert (first.name, second.name) == ("b", "a")
     assert first.elpd == pytest.approx(GOOD.sum(), abs=0.1)
     assert (first.behind, first.behind_error) == (0.0, 0.0)
@@ -255,7 +259,7 @@ def test_the_command_prints_and_writes_the_table(folder, capsys):
     assert "elpd of clip 2" in lines[0]
     text = Path("compared/runs.md").read_text()
     assert "| a | " in text and "expected log predictive density" in text
-    page = Page(Path("compared") / rendering.PAGE)
+    page = Page(Path("compared") / pages.PAGE)
     assert "b predicts best; a is 6.0 ± 0.8 below." in page.text
     rows = json.loads(Path("compared/runs.json").read_text())
     assert [row["name"] for row in rows] == ["b", "a"]

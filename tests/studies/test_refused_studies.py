@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import fitting
-from fitting.experiments import problems
-from fitting.runtime.storage.claimed_folder import claimed
+from fitting.experiment import problems
+from fitting.runtime.claimed_folder import claimed
 from support import quick, small_studies
 from support.commands import refusal
 from support.experiments import FREE, ROOT, write

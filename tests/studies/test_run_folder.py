@@ -20,18 +20,17 @@ import jax
 import numpy as np
 import pytest
 
-from fitting.analysis.goodness.distances import CLOSE, Distances, Kinds, Motion
-from fitting.experiments import experiment_files, parameter_files, problems, systems
-from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.sampling.chain import Chain
-from fitting.inference.sampling.chain_file import Identity
-from fitting.inference.sampling.posterior import digest
-from fitting.problem.free_parameters import gain_readings
-from fitting.runtime.storage.claimed_folder import LOCK, claimed
-from fitting.studies import assess, run_folder
-from fitting.studies.assess import search
-from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit
-from fitting.studies.sample import walker_start
+from fitting.experiment import experiment_files, parameter_files, problems, systems
+from fitting.inference.noise import NoiseOptions
+from fitting.inference.sample.chain import Chain, Identity
+from fitting.inference.sample.posterior import digest
+from fitting.motion.goodness import CLOSE, Distances, Kinds, Motion
+from fitting.problem.space import gain_readings
+from fitting.runtime.claimed_folder import LOCK, claimed
+from fitting.studies.fit import assess, run_folder
+from fitting.studies.fit.assess import search
+from fitting.studies.fit.fit import MAX_START_SD, THRESHOLD_SD, Fit
+from fitting.studies.sample.sample import walker_start
 from fuzz import kept_files
 from jaxik.maths import parameter_tree
 from support import quick, small_studies

@@ -10,24 +10,22 @@ import numpy as np
 import pytest
 
 from fitting import jobs
-from fitting.analysis.placement import Extreme
 from fitting.cli import main
-from fitting.datasets.synthetic import gait
-from fitting.experiments.systems import preset_names, preset_system
-from fitting.report.plots import suite_plots
-from fitting.report.suite import suite_report, suite_tables
+from fitting.experiment.systems import preset_names, preset_system
+from fitting.motion.measures import Extreme
 from fitting.runtime.precision import in_float64
-from fitting.studies.suite import bounds, grounds, situations
-from fitting.studies.suite.bounds import Cell
-from fitting.studies.suite.suite import Suite, run_suite
+from fitting.studies.suite import suite, suite_report
+from fitting.studies.suite import suite as suite_suite
+from fitting.studies.suite.suite import Cell, Suite, run_suite
+from fitting.synthetic import footsteps
 from jaxik.maths import parameter_tree
 
 BRIEF = 1.5  # s
 FEW = ("flat walk", "stairs up")
 
 
-def plan(*names: str) -> situations.Plan:
-    return situations.choose(",".join(names))._replace(seconds=BRIEF)
+def plan(*names: str) -> suite.Plan:
+    return suite.choose(",".join(names))._replace(seconds=BRIEF)
 
 
 @pytest.fixture(scope="module")
@@ -50,26 +48,26 @@ def written(still, tmp_path_factory):
 
 def test_all_situations_have_as_many_frames_and_grounds_of_one_structure():
     structures = set()
-    for situation in situations.SITUATIONS:
+    for situation in suite.SITUATIONS:
         animation = situation.animation(BRIEF)
-        assert animation.clip.frame_count == round(BRIEF * situations.FPS)
+        assert animation.clip.frame_count == round(BRIEF * suite.FPS)
         leaves, structure = jax.tree.flatten(animation.terrain)
         structures.add((structure, tuple(leaf.shape for leaf in leaves)))
     assert len(structures) == 1
 
 
 def test_situations_keep_their_order_and_the_short_form_is_shorter():
-    every, quick = situations.choose(), situations.choose(quick=True)
-    assert every.situations == situations.SITUATIONS
+    every, quick = suite.choose(), suite.choose(quick=True)
+    assert every.situations == suite.SITUATIONS
     assert set(quick.situations) < set(every.situations) and quick.seconds < every.seconds
-    chosen = situations.choose("rubble, hill", quick=True)
+    chosen = suite.choose("rubble, hill", quick=True)
     assert [entry.name for entry in chosen.situations] == ["hill", "rubble"]
 
 
 def test_bodies_have_their_size_and_still_feet():
-    for tall in (situations.CHILD, situations.GIANT):
-        clip = situations.walk_of(tall)(3.0)
-        thighs = np.full(2, tall / situations.ADULT * gait.THIGH)
+    for tall in (suite.CHILD, suite.GIANT):
+        clip = suite.walk_of(tall)(3.0)
+        thighs = np.full(2, tall / suite.ADULT * footsteps.THIGH)
         np.testing.assert_allclose(np.asarray(clip.rig.thigh), thighs, rtol=1e-5)
         standing = clip.stance_labels()[1:] & clip.stance_labels()[:-1]
         steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1)
@@ -78,11 +76,11 @@ def test_bodies_have_their_size_and_still_feet():
 
 def test_stairs_have_their_rises_and_rubble_its_height():
     x, z = np.zeros(1), np.linspace(0.5, 5.0, 4501)
-    heights = grounds.stairs_up(x, z)
-    assert np.unique(np.round(np.diff(np.unique(heights)), 9)) == pytest.approx([grounds.RISE])
-    assert heights.max() == pytest.approx(grounds.RISE * grounds.STEPS)
-    patch = grounds.rubble(np.linspace(-2, 2, 81), np.linspace(-3, 17, 2001)[:, None])
-    assert grounds.RUBBLE / 2 < np.abs(patch).max() <= grounds.RUBBLE
+    heights = suite.stairs_up(x, z)
+    assert np.unique(np.round(np.diff(np.unique(heights)), 9)) == pytest.approx([suite.RISE])
+    assert heights.max() == pytest.approx(suite.RISE * suite.STEPS)
+    patch = suite.rubble(np.linspace(-2, 2, 81), np.linspace(-3, 17, 2001)[:, None])
+    assert suite.RUBBLE / 2 < np.abs(patch).max() <= suite.RUBBLE
     assert np.abs(np.diff(patch, axis=0)).max() < 0.01
 
 
@@ -97,24 +95,26 @@ def test_a_cell_is_within_its_bound():
 
 @in_float64
 def test_a_flat_floor_allows_the_bare_bounds():
-    situation = situations.SITUATIONS[0]
-    limits = bounds.bounds_of(situation.animation(3.0), is_flat=situation.is_flat)
-    assert limits["slide"] == bounds.FLAT_SLIDE
-    assert limits["pop"] == pytest.approx(bounds.POP, abs=2e-4)  # the ball rises as the foot rolls
+    situation = suite.SITUATIONS[0]
+    limits = suite_suite.bounds_of(situation.animation(3.0), is_flat=situation.is_flat)
+    assert limits["slide"] == suite_suite.FLAT_SLIDE
+    assert limits["pop"] == pytest.approx(
+        suite_suite.POP, abs=2e-4
+    )  # the ball rises as the foot rolls
 
 
 @in_float64
 def test_a_curb_allows_as_much_as_a_smooth_swing_onto_it_needs():
-    animation = situations.choose("curb").situations[0].animation(3.0)
+    animation = suite.choose("curb").situations[0].animation(3.0)
     clip = animation.clip
     rises = []  # m per frame, of all swings; the highest ends on the island and began below it
     for leg, ball in enumerate(np.moveaxis(clip.joints_ws(3), 1, 0)):
-        heights = grounds.curb(ball[:, 0], ball[:, 2])
+        heights = suite.curb(ball[:, 0], ball[:, 2])
         stands = np.flatnonzero(clip.stance_labels()[:, leg])
         rises += list(np.abs(np.diff(heights[stands])) / np.diff(stands))
     fastest = 1.875 * max(rises) * 60.0
     assert fastest > 0.3
-    assert bounds.swing_speed(animation) == pytest.approx(fastest, rel=0.1)
+    assert suite_suite.swing_speed(animation) == pytest.approx(fastest, rel=0.1)
 
 
 # What is run and written
@@ -132,7 +132,7 @@ def test_the_numbers_are_those_of_the_cells_and_a_failure_is_beyond_all_bounds(w
     suite, folder = written
     assert all("leg.weight" in scene.failures["failing"] for scene in suite.scenes)
     within, count = suite.counts
-    assert count == 2 * 2 * len(bounds.REASONS) and within < count / 2
+    assert count == 2 * 2 * len(suite_suite.REASONS) and within < count / 2
     content = json.loads((folder / suite_report.NUMBERS).read_text())
     assert [scene["name"] for scene in content["situations"]] == list(FEW)
     assert (content["within"], content["cells"]) == suite.counts
@@ -147,23 +147,23 @@ def test_the_numbers_are_those_of_the_cells_and_a_failure_is_beyond_all_bounds(w
 
 def test_what_is_beyond_its_bound_has_a_mark_and_is_red_in_the_page_and_the_table(written):
     suite, folder = written
-    table = suite_tables.table(suite)
+    table = suite_report.table(suite)
     stairs = next(row for row in table if row[1] == "still" and row is not table[2])
-    assert stairs[2].endswith(suite_tables.MISS)
+    assert stairs[2].endswith(suite_report.MISS)
     text = (folder / suite_report.TABLE).read_text()
     assert f'<span style="color:red">**{stairs[2]}**</span>' in text
-    assert all(reason in text for reason in bounds.REASONS.values())
+    assert all(reason in text for reason in suite_suite.REASONS.values())
     assert "stairs up, still: in the ground" in text and "no motion: " in text
     assert (folder / suite_report.PAGE).read_bytes().startswith(b"\x89PNG")
-    low, high = suite_plots.page(suite).axes[0].get_ylim()
+    low, high = suite_report.page(suite).axes[0].get_ylim()
     assert -0.3 < low < -0.2 and 1.0 < high < 1.2  # from below the soles to above the pelvis
 
 
 def test_misses_say_where_and_how_far():
     extreme = Extreme(0.123, 45, "left")
-    text = suite_tables._miss("pop", Cell(0.08, 0.02, extreme), "unknown")
+    text = suite_report._miss("pop", Cell(0.08, 0.02, extreme), "unknown")
     assert text == "pop 8.0 cm in 1/60 s (≤ 2.0), worst 12.3 cm, left, frame 45"
-    assert suite_tables._miss("reach", Cell(0.5, 0.95, is_least=True), "") == (
+    assert suite_report._miss("reach", Cell(0.5, 0.95, is_least=True), "") == (
         "reached 50.0 % (≥ 95.0)"
     )
 
@@ -186,21 +186,21 @@ def test_an_interrupted_suite_keeps_what_is_finished(still, tmp_path):
 
 
 def test_the_command_prints_the_table_whatever_is_in_it(monkeypatch, still, tmp_path, capsys):
-    monkeypatch.setattr(situations, "SHORT", BRIEF)
+    monkeypatch.setattr(suite, "SHORT", BRIEF)
     run = functools.partial(jobs.run_suite, lambda rig: {"still": still})
     monkeypatch.setattr(jobs, "run_suite", lambda _, *rest, **named: run(*rest, **named))
     words = ["compare", "--suite", "--quick", "--only", "stairs up", "-o", str(tmp_path)]
     assert main.main(words) == 0
     printed = capsys.readouterr()
     assert "cells are within their bounds" in printed.out
-    assert suite_tables.MISS in printed.out and "\x1b" not in printed.out
+    assert suite_report.MISS in printed.out and "\x1b" not in printed.out
 
 
 def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
     names = []
 
     def run(systems_of, plan, *_, **__):
-        names.extend(systems_of(situations.walk(BRIEF).rig))
+        names.extend(systems_of(suite.walk(BRIEF).rig))
         return Suite(plan, ())
 
     monkeypatch.setattr(jobs, "run_suite", run)
@@ -227,7 +227,7 @@ KNOWN_MISSES = {  # by system and situation; cells that are close to their bound
 
 @pytest.mark.parametrize(
     "chosen",
-    [plan(*FEW), pytest.param(situations.choose(quick=True), marks=pytest.mark.slow)],
+    [plan(*FEW), pytest.param(suite.choose(quick=True), marks=pytest.mark.slow)],
     ids=["for a while", "at length"],
 )
 def test_what_is_within_its_bounds_stays_so(chosen):

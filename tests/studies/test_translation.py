@@ -16,20 +16,19 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.analysis import difference
-from fitting.analysis.limit_activity import ClipActivity
+from fitting import clips
 from fitting.cli import main
-from fitting.datasets import clips
-from fitting.datasets.clips import load_clip, save_clip
-from fitting.datasets.flat_animation import load_flat_animation
-from fitting.datasets.terrain import mesh_files
-from fitting.experiments import parameter_files, problems, systems
+from fitting.clips import load_clip, save_clip
+from fitting.experiment import parameter_files, problems, systems
+from fitting.ground import meshes
 from fitting.inference import sensitivity
-from fitting.jobs import fits
-from fitting.report import difference_report, fit_report, translation_report
-from fitting.report.labels import DIFFERENCES
-from fitting.studies import run_folder, translation
-from fitting.studies.animations import Animation
+from fitting.motion import accuracy
+from fitting.motion.flat_animation import load_flat_animation
+from fitting.motion.playback import ClipActivity
+from fitting.report.formatting import DIFFERENCES
+from fitting.studies import translation
+from fitting.studies.animations.animations import Animation
+from fitting.studies.fit import fit_jobs, fit_report, run_folder
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
@@ -81,14 +80,14 @@ def run(source, clip, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         small_studies.quick_fits(patch)
         patch.setattr(Figure, "savefig", save_pixel)
-        patch.setattr(fit_report.limit_activity, "measure", lambda *_: [ACTIVITY])
+        patch.setattr(fit_report.playback, "measure", lambda *_: [ACTIVITY])
         assert main.main(command(clip, folder, source)) == 0
     return folder
 
 
 def test_the_reported_differences_agree_with_an_independent_calculation(run, clip):
     base, reference = load_flat_animation(clip), load_clip(run / "source.npz")
-    animation = Animation(base, mesh_files.load_terrain(GROUND))
+    animation = Animation(base, meshes.load_terrain(GROUND))
     (_, solved), (_, of_source) = (
         animation.solve(parameter_files.load_system(run / name)[0])
         for name in ("record.toml", "source.toml")
@@ -156,20 +155,20 @@ def test_standing_and_moving_frames_are_counted_separately():
     frames = np.arange(4)
     zeros, ones = np.zeros((4, 2)), np.ones((4, 2))
     late = np.stack([np.array([0.0, 0.0, 1.0, 1.0])] * 2, axis=1)
-    correction: dict[str, np.ndarray] = dict.fromkeys(difference.QUANTITIES, ones)
+    correction: dict[str, np.ndarray] = dict.fromkeys(accuracy.QUANTITIES, ones)
     remaining = correction | {"ankle": late, "knee": zeros}
-    half = difference.Difference(("left", "right"), frames * 0.1, frames < 2, correction, remaining)
-    numbers = difference_report.numbers([half])
+    half = accuracy.Difference(("left", "right"), frames * 0.1, frames < 2, correction, remaining)
+    numbers = translation.numbers([half])
     assert numbers["standing"]["ankle"]["reproduced"] == 1.0
     assert numbers["moving"]["ankle"]["reproduced"] == 0.0
     assert numbers["all frames"]["ankle"]["rms"] == pytest.approx(1000 * math.sqrt(0.5))
     assert numbers["all frames"]["knee"]["reproduced"] == 1.0
-    sentence, *_ = difference_report.shortcomings([half], "a", "b")
+    sentence, *_ = translation.shortcomings([half], "a", "b")
     assert sentence == (
         "Ankles: 707.1 mm (rms) remain of 1000 mm, at most 1000 mm at 0.20 s (left)."
     )
-    never = difference.Difference(half.legs, half.time, frames < 0, correction, correction)
-    assert set(difference_report.numbers([never])) == {"all frames"}
+    never = accuracy.Difference(half.legs, half.time, frames < 0, correction, correction)
+    assert set(translation.numbers([never])) == {"all frames"}
 
 
 def test_a_character_stands_below_2_centimetres_a_second(run):
@@ -178,21 +177,21 @@ def test_a_character_stands_below_2_centimetres_a_second(run):
     scene = replace(scene, frames=replace(scene.frames, velocity_ws=jnp.asarray(velocity)))
     unmoved = Mock(spec=jaxik.Result, body=Transform.identity(), pose=scene.frames.pose)
     slow = np.abs(velocity[:, 0]) < 0.02
-    np.testing.assert_array_equal(difference.measure(scene, unmoved).standing, slow)
+    np.testing.assert_array_equal(accuracy.measure(scene, unmoved).standing, slow)
 
 
 def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():
-    correction: dict[str, np.ndarray] = dict.fromkeys(difference.QUANTITIES, np.zeros((3, 1)))
+    correction: dict[str, np.ndarray] = dict.fromkeys(accuracy.QUANTITIES, np.zeros((3, 1)))
     remaining = correction | {"foot": np.full((3, 1), 0.02)}
-    rotated = difference.Difference(
+    rotated = accuracy.Difference(
         ("left",), np.arange(3.0), np.zeros(3, bool), correction, remaining
     )
-    numbers = difference_report.numbers([rotated])["all frames"]
+    numbers = translation.numbers([rotated])["all frames"]
     assert numbers["foot"]["reproduced"] is None
     assert numbers["foot"]["rms"] == pytest.approx(np.degrees(0.02))
-    (text,) = difference_report.shortcomings([rotated], "a", "b")
+    (text,) = translation.shortcomings([rotated], "a", "b")
     assert text.startswith("a leaves the orientation of the feet as animated; b is 1.146 ° (rms)")
-    table = difference_report.table(difference.summarise([rotated])["all frames"], "a")
+    table = translation.table(accuracy.summarise_differences([rotated])["all frames"], "a")
     assert table[4][-1] == "–"
 
 
@@ -210,14 +209,14 @@ def test_only_parameters_that_move_the_clip_are_free_by_default(run):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [(clips, "save_clip"), (fits, "assess_solution")],
+    [(clips, "save_clip"), (fit_jobs, "assess_solution")],
     ids=["before its source", "before its profiles"],
 )
 def test_a_translation_that_dies_after_its_search_goes_on_in_its_folder(
     run, clip, source, tmp_path, monkeypatch, module, name, capsys
 ):
     small_studies.quick_fits(monkeypatch)
-    monkeypatch.setattr(translation_report, "write", lambda *_: None)
+    monkeypatch.setattr(translation, "write", lambda *_: None)
     out = tmp_path / "run"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr(module, name, lambda *_, **__: 1 / 0)

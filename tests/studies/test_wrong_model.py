@@ -13,19 +13,23 @@ from scipy.spatial.transform import Rotation
 
 import fitting
 import jaxik
-from fitting.analysis.goodness.distances import CLOSE
 from fitting.cli import main
-from fitting.datasets.clips import contacts
-from fitting.experiments import problems
-from fitting.experiments.experiment_files import load_experiment
+from fitting.clips import contacts
+from fitting.experiment import problems
+from fitting.experiment.experiment_files import load_experiment
 from fitting.inference import sensitivity
-from fitting.problem.free_parameters import present_value
-from fitting.report.calibration import wrong_model_report
-from fitting.report.page import rendering
-from fitting.studies.calibration import capture_errors, wrong_model_assessment
-from fitting.studies.calibration.capture_errors import LARGEST, ErrorSizes
-from fitting.studies.calibration.wrong_model import SPREAD, draw_system
-from fitting.studies.calibration.wrong_model_assessment import assess, is_true
+from fitting.motion.goodness import CLOSE
+from fitting.problem.space import present_value
+from fitting.report import pages
+from fitting.studies.calibrate import wrong_model, wrong_model_report
+from fitting.studies.calibrate.wrong_model import (
+    LARGEST,
+    SPREAD,
+    ErrorSizes,
+    assess,
+    draw_system,
+    is_true,
+)
 from support import small_studies
 from support.experiments import CLIP, ROOT, write
 from support.pages import Page
@@ -60,7 +64,7 @@ def changes(problem, mask_pops=False, seed=0, **sizes: float) -> Changes:
     random = np.random.default_rng(seed)
     with jax.enable_x64(True):
         sizes_of_errors = dataclasses.replace(NONE, **sizes)
-        captured = capture_errors.with_errors(problem, sizes_of_errors, [mask_pops], random)
+        captured = wrong_model.with_errors(problem, sizes_of_errors, [mask_pops], random)
     before, after = (jax.tree.map(np.asarray, p.data[0].reference) for p in (problem, captured))
     return Changes(
         after.pelvis.pos - before.pelvis.pos,
@@ -85,7 +89,7 @@ def test_the_floor_drifts_slowly_and_everything_with_it(problem):
     np.testing.assert_allclose(knee, np.broadcast_to(pelvis[:, None], knee.shape), atol=1e-12)
     np.testing.assert_allclose(ankle, knee, atol=1e-12)
     assert 0.001 < np.ptp(height) <= 0.02 and not turn.any()
-    fastest = 0.01 * 2 * math.pi / capture_errors.DRIFT_PERIODS[0]  # m/s
+    fastest = 0.01 * 2 * math.pi / wrong_model.DRIFT_PERIODS[0]  # m/s
     dt = np.asarray(problem.data[0].frames.dt)
     assert np.abs(np.diff(height) / dt[1:]).max() < fastest
 
@@ -105,7 +109,7 @@ def test_offsets_are_constant_in_the_pelvis_and_turns_constant(problem):
 
 def test_a_swing_leaves_its_path_smoothly_and_a_standing_foot_stays(problem):
     pelvis, knee, ankle, turn, _ = changes(problem, swing=0.03)
-    moving = np.asarray(problem.data[0].frames.foot_speed) > capture_errors.SWING_SPEED
+    moving = np.asarray(problem.data[0].frames.foot_speed) > wrong_model.SWING_SPEED
     size = np.linalg.norm(ankle, axis=-1)
     assert not size[~moving].any() and not pelvis.any() and not turn.any()
     np.testing.assert_allclose(knee, 0.5 * ankle, atol=1e-12)
@@ -118,14 +122,12 @@ def test_a_swing_leaves_its_path_smoothly_and_a_standing_foot_stays(problem):
 
 def test_pops_are_jumps_of_a_few_frames_which_a_fit_leaves_out(problem):
     shape = (len(TIME), 5, 3)
-    pops = [
-        capture_errors.pops(shape, TIME, 0.1, np.random.default_rng(seed)) for seed in range(200)
-    ]
+    pops = [wrong_model.pops(shape, TIME, 0.1, np.random.default_rng(seed)) for seed in range(200)]
     size = np.linalg.norm(pops, axis=-1)
     np.testing.assert_allclose(size[size > 0], 0.1)
     runs = [contacts.runs(joint > 0) for replicate in size for joint in replicate.T]
     lengths = [last - first + 1 for each in runs for first, last in each]
-    assert len(lengths) / 200 == pytest.approx(TIME[-1] / capture_errors.POP_EVERY, rel=0.1)
+    assert len(lengths) / 200 == pytest.approx(TIME[-1] / wrong_model.POP_EVERY, rel=0.1)
     assert set(lengths) >= {1, 2, 3, 4} and np.mean(lengths) == pytest.approx(2.5, abs=0.2)
     whole, masked = (changes(problem, mask, seed=3, pop=1.0).seen for mask in (False, True))
     assert whole.all() and 0 < (~masked).sum() < 60
@@ -133,9 +135,7 @@ def test_pops_are_jumps_of_a_few_frames_which_a_fit_leaves_out(problem):
 
 def test_sizes_are_drawn_between_none_and_the_largest():
     random = np.random.default_rng(0)
-    drawn = np.array(
-        [dataclasses.astuple(capture_errors.draw_sizes(random, 2.0)) for _ in range(999)]
-    )
+    drawn = np.array([dataclasses.astuple(wrong_model.draw_sizes(random, 2.0)) for _ in range(999)])
     fractions = drawn / (2 * np.array(dataclasses.astuple(LARGEST)))
     np.testing.assert_allclose(fractions.mean(axis=0), 0.5, atol=0.04)
     assert fractions.min() >= 0 and fractions.max() <= 1
@@ -221,7 +221,7 @@ def test_a_verdict_is_true_unless_the_motion_without_errors_says_otherwise(
     fit = replicate(captured, noise_free)
     if word == "does not fit":  # which is not about the motion without errors
         fit = replicate(captured, FAR if not true else judgement(), noise_free)
-    assert wrong_model_assessment.word(captured) == word
+    assert wrong_model.word(captured) == word
     assert is_true(fit) is true
     assert (", which is not true" in wrong_model_report.fit_line(fit)) is not true
 
@@ -296,7 +296,7 @@ def test_the_command_reports_what_it_found(finished):
         assert captured != lasting != noise_free and captured["animation"]["ankle"] > 0.01
     summary = (out / "summary.md").read_text()
     assert "drawn around `record`" in summary and "| true verdicts | " in summary
-    page = Page(out / rendering.PAGE)
+    page = Page(out / pages.PAGE)
     assert "h2 Checks" in page.headings and "Made by record" in page.text
     assert "So few motions prove little: the share of true verdicts may be" in page.text
 

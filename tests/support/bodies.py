@@ -5,9 +5,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
-from fitting.datasets.clips.clip import Clip
-from fitting.datasets.flat_animation import with_rigid_legs
+from fitting.clips.assemble import JointMotion, clip_from_joints
+from fitting.clips.clip import Clip
+from fitting.motion.flat_animation import with_rigid_legs
 
 
 def scaled(clip: Clip, size: float, *, froude: bool = False) -> Clip:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips import Clip
+from fitting.clips import Clip
 
 WIDTHS = {"KneeWidth": 104.0, "AnkleWidth": 70.0}  # mm
 MEASURES = {letter + name: width for letter in "LR" for name, width in WIDTHS.items()}

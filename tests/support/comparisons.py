@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 
-from fitting.analysis.measures import Measures
-from fitting.datasets.clips import edit
-from fitting.datasets.clips.clip import Clip
-from fitting.datasets.flat_animation import load_flat_animation
-from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.report.labels import MEASURES
-from fitting.studies import comparison
-from fitting.studies.animations import Animation
-from fitting.studies.comparison import ANIMATED, Comparison
+from fitting.clips import edit
+from fitting.clips.clip import Clip
+from fitting.ground.meshes import load_terrain
+from fitting.motion.flat_animation import load_flat_animation
+from fitting.motion.measures import Measures
+from fitting.report.formatting import MEASURES
+from fitting.studies.animations.animations import Animation
+from fitting.studies.compare import comparison
+from fitting.studies.compare.comparison import ANIMATED, Comparison
 
 from .experiments import ROOT
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fitting.datasets.clips import Clip, contacts
-from fitting.datasets.synthetic.terrain_meshes import Point, strip
-from fitting.datasets.terrain.meshes import Mesh
+from fitting.clips import Clip, contacts
+from fitting.ground.meshes import Mesh
+from fitting.synthetic.terrain_meshes import Point, strip
 from jaxik.world import terrain
 from jaxik.world.terrain import Terrain
 

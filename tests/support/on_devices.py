@@ -33,7 +33,7 @@ def main() -> None:
 
 def make_problem():
     """Of three clips, each of which runs alone."""
-    from fitting.experiments import problems
+    from fitting.experiment import problems
     from support.scenes import experiment
 
     problem = problems.make_problem(experiment())
@@ -103,7 +103,7 @@ def log_probabilities() -> dict[str, np.ndarray]:
     import jax
     import jax.numpy as jnp
 
-    from fitting.inference.noise.marginal import with_unknown_sigmas
+    from fitting.inference.noise import with_unknown_sigmas
     from fitting.inference.sharding import over_devices
 
     given = make_problem()

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from fitting.analysis.playback import RESIDUAL_KINDS, Motion, Playback
+from fitting.motion.playback import RESIDUAL_KINDS, Motion, Playback
 
 FPS, FRAMES = 30.0, 300
 LEGS = ("left", "right")

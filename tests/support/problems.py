@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.inference.sampling.posterior import Posterior
-from fitting.problem.free_parameters import free_parameter
+from fitting.inference.sample.posterior import Posterior
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
+from fitting.problem.space import free_parameter, make_space
 from jaxik.maths import parameter_tree
 
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fitting.inference.profiles.heights import usual_rise
-from fitting.inference.profiles.profile import Profile, make_profile
-from fitting.problem.free_parameters import FreeParameter, from_fractions, to_fractions
+from fitting.inference.profiles.profile import Profile, make_profile, usual_rise
+from fitting.problem.space import FreeParameter, from_fractions, to_fractions
 
 
 def parabola(parameter: FreeParameter, interval: tuple[float, float], size: int = 1) -> Profile:

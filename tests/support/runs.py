@@ -7,15 +7,14 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.analysis import playback
-from fitting.analysis.limit_activity import ClipActivity
-from fitting.experiments import experiment_files, problems
+from fitting.experiment import experiment_files, problems
 from fitting.inference.identifiability import Identifiability
-from fitting.inference.optimisation.solution import Progress, Solution
-from fitting.report.page import fit_page
-from fitting.report.page.fit_page import Measured
-from fitting.studies import run_folder
-from fitting.studies.fit import Fit
+from fitting.inference.optimise.solution import Progress, Solution
+from fitting.motion import playback
+from fitting.motion.playback import ClipActivity
+from fitting.studies.fit import fit_page, run_folder
+from fitting.studies.fit.fit import Fit
+from fitting.studies.fit.fit_page import Measured
 
 from .experiments import CLIP, write
 from .profiles import parabolas

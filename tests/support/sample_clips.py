@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
-from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.leg_geometry import knee_positions, leg_rotations, unit
-from fitting.datasets.flat_animation import HeightFunction
+from fitting.clips.assemble import JointMotion, clip_from_joints
+from fitting.clips.clip import Clip
+from fitting.clips.rigs import knee_positions, leg_rotations, unit
+from fitting.motion.flat_animation import HeightFunction
 
 FPS = 60.0
 STRIDE, LIFT = 0.6, 0.12  # m

@@ -3,8 +3,8 @@
 import tempfile
 from pathlib import Path
 
-from fitting.experiments.experiment import Experiment
-from fitting.experiments.experiment_files import load_experiment
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
 from support.experiments import CLIP, write
 
 LENGTHS = (0.5, 0.3, 0.6)  # s

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from pytest import MonkeyPatch
 
-from fitting.experiments import problems
-from fitting.jobs import populations
+from fitting.experiment import problems
 from fitting.studies import ablation
-from fitting.studies.animations import Animation
-from fitting.studies.calibration import replicates
-from fitting.studies.hierarchy import population
+from fitting.studies.animations.animations import Animation
+from fitting.studies.calibrate import replicates
+from fitting.studies.population import population, population_report
 from jaxik.maths import parameter_tree
 
 from . import quick
@@ -136,7 +135,9 @@ def quick_population(
     """A population whose clips are two numbers each."""
     make = problems.make_problem
     patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_references)
-    patch.setattr(populations, "make_problem", lambda e: quick.with_measured(make(e), measured))
+    patch.setattr(
+        population_report, "make_problem", lambda e: quick.with_measured(make(e), measured)
+    )
     patch.setattr(population, "error_at", error_at)
     return write_population(folder, rest)
 

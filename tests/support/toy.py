@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.inference.optimisation import search
-from fitting.inference.optimisation.solution import Solution
+from fitting.inference.optimise import search
+from fitting.inference.optimise.solution import Solution
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree, smoothing
 from jaxik.maths.gate import HARD

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fitting.jobs import views
-from fitting.jobs.views import Address
-from fitting.problem.free_parameters import free_parameter
-from fitting.viewer import subject_of_run
+from fitting.problem.space import free_parameter
+from fitting.viewer import subject_of_run, views
+from fitting.viewer.views import Address
 from support import runs
 from support.browsers import launch, needs_chromium
 

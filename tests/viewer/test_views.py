@@ -10,22 +10,20 @@ import numpy as np
 import pytest
 
 from fitting import viewer
-from fitting.analysis.placement import SLIDE_LIMIT, VISIBLE, Soles
-from fitting.datasets.clips import save_clip
-from fitting.experiments import parameter_files
-from fitting.experiments.systems import Preset
-from fitting.inference.optimisation.solution import Progress, Report
-from fitting.jobs import views
-from fitting.jobs.views import Address, FitWatch
-from fitting.problem.free_parameters import free_parameter
-from fitting.studies.animations import AnimationFiles, load_animation
-from fitting.studies.motions.fit_motions import saved_clips
-from fitting.viewer import Solver, saving, solving
-from fitting.viewer.feet import IN_GROUND, Sight, seen
-from fitting.viewer.knobs import knobs
-from fitting.viewer.latest import Latest
-from fitting.viewer.lines import Lines
+from fitting.clips import save_clip
+from fitting.experiment import parameter_files
+from fitting.experiment.systems import Preset
+from fitting.inference.optimise.solution import Progress, Report
+from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Soles
+from fitting.problem.space import free_parameter
+from fitting.studies.animations.animations import AnimationFiles, load_animation
+from fitting.studies.fit.fit_motions import saved_clips
+from fitting.viewer import Solver, solving, tuning, views
+from fitting.viewer.page import Latest
+from fitting.viewer.solving import IN_GROUND, Sight, seen
+from fitting.viewer.subject import Lines, knobs
 from fitting.viewer.tuning import PAUSE, Tuning
+from fitting.viewer.views import Address, FitWatch
 from jaxik import presets, record
 from jaxik.maths import parameter_tree
 from support import runs
@@ -109,8 +107,8 @@ def test_undo_redo_and_reset(ik, by_name):
 def test_what_is_saved_is_read_again_but_no_record_that_would_lose_something_is_written(tmp_path):
     ik = presets.record(faithful=True)
     knob = next(knob for knob in knobs(ik) if knob.name == "pelvis.limit")
-    said = saving.save(tmp_path, knob.write(ik, 0.123), FAITHFUL)
-    saving.save(tmp_path, ik, FAITHFUL)
+    said = tuning.save(tmp_path, knob.write(ik, 0.123), FAITHFUL)
+    tuning.save(tmp_path, ik, FAITHFUL)
     loaded, preset = parameter_files.load_system(tmp_path / "tuned.toml")
     content = (tmp_path / "tuned.bin").read_bytes()
     for read in (loaded, record.to_ik(record.from_bytes(content))):
@@ -118,13 +116,13 @@ def test_what_is_saved_is_read_again_but_no_record_that_would_lose_something_is_
     assert preset == FAITHFUL and (tmp_path / "tuned_2.toml").exists()
     assert "knee" in said[-1]  # the bytes hold more than parameters
     ik = parameter_tree.replace(ik, {"leg.soften": 0.9})
-    (_, refused) = saving.save(tmp_path, ik, FAITHFUL)
+    (_, refused) = tuning.save(tmp_path, ik, FAITHFUL)
     assert "No record is written" in refused and "leg.soften = 0.9" in refused
     assert (tmp_path / "tuned_3.toml").exists() and not (tmp_path / "tuned_3.bin").exists()
-    said = saving.save(tmp_path, ik, FAITHFUL, drop=True)
+    said = tuning.save(tmp_path, ik, FAITHFUL, drop=True)
     assert any("leg.soften = 0.9" in line for line in said)
     assert (tmp_path / "tuned_4.bin").stat().st_size == 128
-    (_, refused) = saving.save(tmp_path, presets.ozz(), Preset("ozz"))
+    (_, refused) = tuning.save(tmp_path, presets.ozz(), Preset("ozz"))
     assert "only those of 'record' make one" in refused
 
 
@@ -310,8 +308,7 @@ def test_only_pages_of_its_own_address_on_this_machine_can_connect_and_titles_ar
     from websockets.sync.client import connect
     from websockets.typing import Origin, Subprotocol
 
-    from fitting.viewer.page import open_server, stop
-    from fitting.viewer.page.words import literal
+    from fitting.viewer.page import literal, open_server, stop
 
     server = open_server("127.0.0.1", 0, "test")
     try:

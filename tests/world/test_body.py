@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
-from fitting.datasets.clips import edit, load_clip
+from fitting.clips import edit, load_clip
+from fitting.clips.clip_frames import frames_from_clip
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Leaf, Rule, constant, half_life_parameter, parameter, switch

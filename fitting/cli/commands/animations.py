@@ -6,14 +6,14 @@ from pathlib import Path
 
 from fitting import jobs, viewer
 from fitting.cli.terminal import show
-from fitting.experiments import parameter_files, systems
-from fitting.experiments.systems import Preset
-from fitting.jobs.views import Address, check_folder
+from fitting.experiment import parameter_files, systems
+from fitting.experiment.systems import Preset
 from fitting.runtime import activity, cache_folder
 from fitting.runtime.precision import in_float64
-from fitting.studies import comparison
-from fitting.studies.animations import AnimationFiles
-from fitting.studies.suite import situations
+from fitting.studies.animations.animations import AnimationFiles
+from fitting.studies.compare import comparison
+from fitting.studies.suite import suite as suite_suite
+from fitting.viewer.views import Address, check_folder
 from jaxik import FootIK, Rig
 
 from . import reading, status
@@ -109,7 +109,7 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
             raise ValueError(f"{name} is {given}; the suite has animations and grounds of its own")
     requested = options.systems or [("--presets", ",".join(systems.preset_names()))]
     comparison.named_systems(requested)  # reports mistakes before anything runs
-    plan = situations.choose(options.only, quick=options.quick)
+    plan = suite_suite.choose(options.only, quick=options.quick)
 
     def systems_of(rig: Rig) -> dict[str, FootIK]:
         return comparison.named_systems(requested, rig)

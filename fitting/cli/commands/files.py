@@ -8,15 +8,15 @@ from pathlib import Path
 from fitting import jobs
 from fitting.cli.parsers.files import TEMPLATE
 from fitting.cli.terminal import show
-from fitting.datasets.clips import load_clip, summary
-from fitting.datasets.clips.load import draft_joint_map
-from fitting.datasets.terrain.reconstruction import reconstruct
-from fitting.experiments import parameter_files, record_files, systems
-from fitting.report import terrain_report
+from fitting.clips import load_clip, summary
+from fitting.clips.load import draft_joint_map
+from fitting.experiment import parameter_files, record_files, systems
+from fitting.ground.reconstruction import reconstruct
 from fitting.report.formatting import TableText, aligned
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
+from fitting.studies import terrain_report
 from jaxik import record
 
 from . import reading

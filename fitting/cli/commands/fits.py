@@ -6,16 +6,16 @@ import functools
 from fitting import jobs
 from fitting.cli import progress
 from fitting.cli.terminal import show
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.record_only import restrict
-from fitting.experiments.systems import Preset
-from fitting.jobs.views import Address, FitWatch
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.record_files import restrict
+from fitting.experiment.systems import Preset
 from fitting.runtime import cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
-from fitting.studies.animations import AnimationFiles
+from fitting.studies.animations.animations import AnimationFiles
 from fitting.studies.drafts.draft import DraftRequest
 from fitting.studies.translation import TranslationRequest
+from fitting.viewer.views import Address, FitWatch
 
 from . import reading, status
 

@@ -6,27 +6,27 @@ import shutil
 from pathlib import Path
 
 from fitting.cli.terminal import show
-from fitting.experiments import systems
-from fitting.experiments.schema.experiment_schema import experiment_schema
-from fitting.jobs import examples
+from fitting.experiment import systems
+from fitting.experiment.schema import experiment_schema
+from fitting.report import guides
 from fitting.report.formatting import aligned
-from fitting.report.guides import key_list, parameter_list
 from fitting.runtime import files
+from fitting.studies import exports
 
 
 def parameters(options: argparse.Namespace) -> int:
     """Lists the parameters of a preset."""
     ik = systems.preset_system(options.preset, faithful=options.faithful)
-    listed = parameter_list.list_parameters(ik, options.search or "")
+    listed = guides.list_parameters(ik, options.search or "")
     if not listed:
         raise ValueError(f"no parameter of {options.preset} mentions {options.search!r}")
     match options.format:
         case "text":
-            text = parameter_list.as_text(listed, _width(options.output))
+            text = guides.parameters_as_text(listed, _width(options.output))
         case "markdown":
-            text = parameter_list.as_markdown(listed)
+            text = guides.parameters_as_markdown(listed)
         case _:
-            text = parameter_list.as_json(listed)
+            text = guides.as_json(listed)
     return _print_or_write(text, options.output)
 
 
@@ -34,9 +34,9 @@ def schema(options: argparse.Namespace) -> int:
     """Lists the keys of experiment files, or writes their JSON Schema."""
     match options.format:
         case "text":
-            text = key_list.as_text(experiment_schema(), _width(options.output))
+            text = guides.keys_as_text(experiment_schema(), _width(options.output))
         case "markdown":
-            text = key_list.as_markdown(experiment_schema())
+            text = guides.keys_as_markdown(experiment_schema())
         case _:
             text = _schema_as_json()
     return _print_or_write(text, options.output)
@@ -47,11 +47,11 @@ def example(options: argparse.Namespace) -> int:
     if options.name is None:
         if options.output is not None:
             raise ValueError("-o needs the NAME of an experiment; `jaxik example` lists them")
-        rows = [[name, title] for name, title in examples.names().items()]
+        rows = [[name, title] for name, title in exports.names().items()]
         show(aligned([["name", "experiment"], *rows]))
         return 0
     folder = Path(options.name).name if options.output is None else options.output
-    path = examples.copy(options.name, Path(folder), _schema_as_json())
+    path = exports.copy(options.name, Path(folder), _schema_as_json())
     print(f"written to {path}; now: jaxik fit {path} -o runs/{path.stem}")
     return 0
 

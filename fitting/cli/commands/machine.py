@@ -5,12 +5,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from fitting.bench import measurement, suite
 from fitting.bench import report as bench_report
-from fitting.bench import runner, suite
-from fitting.bench.sizes import FULL, QUICK
+from fitting.bench.workloads import FULL, QUICK
 from fitting.cli import progress
 from fitting.cli.terminal import show
-from fitting.report.guides.layout import wrapped
+from fitting.report.layout import wrapped
 from fitting.runtime import activity, cache_folder
 from fitting.runtime.validation import in_one_line
 
@@ -24,7 +24,7 @@ def bench(options: argparse.Namespace) -> int:
     sizes = QUICK if options.quick else FULL
     title = f"Running {len(chosen)} benchmarks"
     with activity.announced(title), progress.ProgressLine(str) as line:
-        report = runner.run_benchmarks(chosen, sizes, options.quick, _print_line, line)
+        report = measurement.run_benchmarks(chosen, sizes, options.quick, _print_line, line)
     written = bench_report.write(report, options.json, plot)
     show(bench_report.text(report))
     for path in written:

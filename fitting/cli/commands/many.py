@@ -4,8 +4,8 @@ import argparse
 
 from fitting import jobs
 from fitting.cli.terminal import show
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.record_only import restrict
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.record_files import restrict
 from fitting.runtime import cache_folder
 
 from . import status

@@ -3,8 +3,8 @@
 import argparse
 from dataclasses import fields
 
-from fitting.datasets.clips.load import ClipOptions
-from fitting.datasets.terrain.mesh_files import TerrainOptions
+from fitting.clips.load import ClipOptions
+from fitting.ground.meshes import TerrainOptions
 
 
 def clip_options(options: argparse.Namespace) -> ClipOptions:

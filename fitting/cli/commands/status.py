@@ -1,7 +1,7 @@
 """Exit statuses of the commands."""
 
-from fitting.studies.fit import Fit
-from fitting.studies.many.progress import ManyFits
+from fitting.studies.fit.fit import Fit
+from fitting.studies.many.many_tasks import ManyFits
 
 NOT_CONVERGED = 3  # the search of a fit
 DOES_NOT_FIT = 4  # a fit that has converged

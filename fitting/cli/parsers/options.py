@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
-from fitting.cli.terminal.help_texts import help_formatter
+from fitting.cli.help_texts import help_formatter
 from fitting.runtime import validation
 
 Number = TypeVar("Number", int, float)

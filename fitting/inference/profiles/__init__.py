@@ -1,6 +1,6 @@
 """Profiles: how far the cost must rise when one parameter is held at a value and all others follow.
 
-`profile.py` reads intervals, valleys and a verdict off the curve of one parameter. The others find
-the curves: `curves.py` holds their points, `conditional.py` finds the lowest cost at given values,
-`single_moves.py` the thresholds to begin with there, and `profiling.py` chooses the values.
+`profile` reads intervals, local minima and a verdict off the curve of one parameter, and holds its
+points. `conditional` finds the lowest cost at given values, and `profiling` chooses the values and
+the thresholds to begin with there.
 """

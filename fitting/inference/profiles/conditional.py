@@ -16,16 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitting.inference.optimisation import levenberg_marquardt, population
-from fitting.inference.optimisation.models import HardModel
-from fitting.inference.optimisation.population import Slopes
-from fitting.inference.optimisation.solution import Solution
-from fitting.problem.free_parameters import to_fractions
+from fitting.inference.optimise import evolution, levenberg_marquardt
+from fitting.inference.optimise.evolution import Slopes
+from fitting.inference.optimise.levenberg_marquardt import HardModel
+from fitting.inference.optimise.solution import Solution
 from fitting.problem.problem import Problem
-from fitting.problem.space import EDGE
+from fitting.problem.space import EDGE, to_fractions
 from fitting.runtime.threads import on_all_cores
-
-from .secants import slopes_of_thresholds
 
 CANDIDATES = 12  # for each value in a generation
 GENERATIONS = 3  # of candidates
@@ -34,6 +31,11 @@ MIN_GAIN = 0.02  # of the cost; less ends a descent
 NEAR = 0.5  # of u: around the solution, its Jacobian still holds
 MOVES = (0.05, 0.5)  # size of random moves, in standard deviations of Laplace's approximation
 FURTHEST = 4.0  # of u: no parameter follows further than that in one step
+
+SECANT_STEPS = 2.0 ** -np.arange(14)  # of u, each twice the next
+CHANGE = 2.0  # of the residuals, half their square: what a step should bring
+CHANGES = (0.3, 20.0)  # and may bring
+GRADUAL = (0.15, 0.4)  # change in half a step over that in a whole one, a quarter if proportional
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,12 +101,12 @@ class Conditional:
 
     def points(self, u: Float[np.ndarray, "points free"]) -> Points:
         """Points with their values and costs."""
-        cost = population.evaluate(self.problem, u).cost
+        cost = evolution.evaluate(self.problem, u).cost
         return Points(u, self.problem.space.values(u), cost)
 
     def evaluate(self, u: Float[np.ndarray, "points free"]) -> tuple[Points, np.ndarray]:
         """Points, and the gradients of their costs by the solution's Jacobian."""
-        evaluation = population.evaluate(self.problem, u, self.slopes)
+        evaluation = evolution.evaluate(self.problem, u, self.slopes)
         gradient = -(evaluation.stepped - u) @ self.gram
         return Points(u, self.problem.space.values(u), evaluation.cost), gradient
 
@@ -247,3 +249,34 @@ def join(parts: Sequence[Points]) -> Points:
         np.concatenate([part.values for part in parts]),
         np.concatenate([part.cost for part in parts]),
     )
+
+
+def slopes_of_thresholds(
+    problem: Problem, u: Float[np.ndarray, " free"]
+) -> Float[np.ndarray, "residuals free"]:
+    """Slopes of the residuals by each threshold; 0 where its effect is not gradual, or smooth."""
+    here = evolution.residuals(problem, u[None])[0]
+    slopes = np.zeros((len(here), len(u)))
+    for i in np.flatnonzero(problem.space.thresholds):
+        steps = np.outer([-1, 1], SECANT_STEPS)
+        moved = u + np.outer(steps, np.arange(len(u)) == i)
+        changes = (evolution.residuals(problem, moved) - here).reshape(*steps.shape, -1)
+        chosen = [(side, k) for side in (0, 1) if (k := _secant(changes[side])) is not None]
+        if chosen:
+            first, last = chosen[0], chosen[-1]
+            rise, run = changes[last], steps[last]
+            if last != first:
+                rise, run = rise - changes[first], run - steps[first]
+            slopes[:, i] = rise / run
+    return slopes
+
+
+def _secant(changes: Float[np.ndarray, "steps residuals"]) -> int | None:
+    """Index of the step to take, if the residuals change gradually along it."""
+    size = 0.5 * np.sum(changes**2, axis=1)
+    whole, half = size[:-1], size[1:]
+    fits = np.isfinite(whole) & (whole > CHANGES[0]) & (whole < CHANGES[1])
+    fits[fits] &= (half[fits] > GRADUAL[0] * whole[fits]) & (half[fits] < GRADUAL[1] * whole[fits])
+    if not fits.any():
+        return None
+    return int(np.argmin(np.where(fits, np.abs(np.log(np.where(fits, whole, 1) / CHANGE)), np.inf)))

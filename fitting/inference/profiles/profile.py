@@ -5,15 +5,27 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import chdtr
 
-from fitting.problem.free_parameters import FreeParameter, from_fractions, to_fractions
+from fitting.problem.problem import Problem
+from fitting.problem.space import EDGE, FreeParameter, from_fractions, to_fractions
 
-from .heights import max_rise
+from .conditional import Points, Targets, join
 
 BARRIER = 2.0  # times that rise, at least, lies between two valleys
 SEPARATION = 0.05  # fraction of the range, at least, likewise: hard decisions make small cliffs
 
 Verdict = Literal["two-sided", "at least", "at most", "flat", "several valleys"]
+
+SAME_PLACE = 1e-9  # fraction of the range
+
+LEVEL = 0.95
+# Rise of the cost at the ends of a 95 % interval. A smooth parameter: half the quantile of the
+# chi-square distribution with one degree of freedom. A threshold, whose cost is a walk of random
+# steps to either side: half of 7.35 (Hansen, Sample splitting and threshold estimation, 2000).
+RISE_OF_SMOOTH = 1.92
+RISE_OF_THRESHOLD = 3.68
+CELLS = 16  # between two points of a profile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,3 +182,138 @@ def _verdict(valleys: int, free_below: bool, free_above: bool) -> Verdict:
     if free_below and free_above:
         return "flat"
     return "at most" if free_below else "at least" if free_above else "two-sided"
+
+
+class Curves:
+    """For each parameter the lowest points known, sorted by its value."""
+
+    def __init__(self, problem: Problem, solution: Points):
+        self.problem, self.space = problem, problem.space
+        self.curves = [solution for _ in range(problem.space.size)]
+
+    def add(self, targets: Targets, points: Points) -> None:
+        """Adds a point to the curve of each target's parameter; of two in a place, the lower."""
+        for i in np.unique(targets.index):
+            both = join([self.curves[i], points[targets.index == i]])
+            both = both[np.isfinite(both.cost)]
+            own = to_fractions(self.space.parameters[i], both.values[:, i])
+            order = np.lexsort((both.cost, np.round(own / SAME_PLACE)))
+            own = own[order]
+            first = np.concatenate([[True], np.diff(own) > SAME_PLACE])
+            self.curves[i] = both[order[first]]
+
+    def fractions(self, i: int) -> Float[np.ndarray, " points"]:
+        """Where the points of a curve lie in the parameter's range, 0..1, rising."""
+        return to_fractions(self.space.parameters[i], self.curves[i].values[:, i])
+
+    def nearest(self, i: int, place: float) -> Points:
+        """The point of a curve that is nearest to a fraction of the range, alone."""
+        k = int(np.argmin(np.abs(self.fractions(i) - place)))
+        return self.curves[i][k : k + 1]
+
+    def rises(self, i: int) -> Float[np.ndarray, " points"]:
+        """Cost of a curve's points above its lowest."""
+        return self.curves[i].cost - self.curves[i].cost.min()
+
+    def data_rises(self, i: int) -> Float[np.ndarray, " points"]:
+        """The same of the cost without the parameter's own prior."""
+        curve = self.curves[i]
+        cost = curve.cost - self.problem.prior_costs(curve.u)[:, i]
+        return cost - cost.min()
+
+    def highest(self, i: int) -> float:
+        """Rise of the cost within the 95 % interval of a parameter."""
+        return max_rise(self.space.parameters[i], self.curves[i].values[:, i], self.rises(i))
+
+    @property
+    def best(self) -> Points:
+        """The lowest point of all, alone."""
+        together = join(self.curves)
+        lowest = int(np.argmin(together.cost))
+        return together[lowest : lowest + 1]
+
+    def share(self) -> None:
+        """Gives every curve the points of the others that lie below it."""
+        together = join(
+            [curve[self.rises(i) < 4 * self.highest(i)] for i, curve in enumerate(self.curves)]
+        )
+        for i, parameter in enumerate(self.space.parameters):
+            own = to_fractions(parameter, together.values[:, i])
+            known = np.interp(own, self.fractions(i), self.curves[i].cost)
+            lower = together[together.cost < known - 0.01]
+            self.add(Targets(np.full(len(lower.cost), i), lower.values[:, i]), lower)
+
+    def profiles(self) -> dict[str, Profile]:
+        """The profile of each parameter, by name."""
+        return {
+            parameter.name: make_profile(
+                parameter,
+                curve.values,
+                curve.values[:, i],
+                curve.cost,
+                self.problem.prior_costs(curve.u)[:, i],
+            )
+            for i, (parameter, curve) in enumerate(
+                zip(self.space.parameters, self.curves, strict=True)
+            )
+        }
+
+
+def usual_rise(parameter: FreeParameter) -> float:
+    """Rise of the cost at the ends of a 95 % interval, where the profile has its usual shape."""
+    return RISE_OF_THRESHOLD if parameter.kind == "threshold" else RISE_OF_SMOOTH
+
+
+def max_rise(
+    parameter: FreeParameter,
+    values: Float[np.ndarray, " points"],
+    rises: Float[np.ndarray, " points"],
+) -> float:
+    """Rise of the cost within a 95 % interval of a profile through these points.
+
+    Args:
+        parameter: whose profile it is.
+        values: of the parameter, rising.
+        rises: of the cost, prior included.
+    """
+    usual = usual_rise(parameter)
+    cells, mass = _density(parameter, values, rises)
+    if not len(cells):
+        return usual
+    order = np.argsort(cells, kind="stable")
+    inside = np.searchsorted(np.cumsum(mass[order]), LEVEL * mass.sum())
+    return max(usual, float(cells[order[min(inside, len(order) - 1)]]))
+
+
+def level_of(
+    parameter: FreeParameter,
+    values: Float[np.ndarray, " points"],
+    rises: Float[np.ndarray, " points"],
+    rise: float,
+) -> float:
+    """Level, 0..1, of the interval of a smooth parameter whose ends rise as far as this.
+
+    Args:
+        parameter: whose profile it is.
+        values: of the parameter, rising.
+        rises: of the cost, prior included.
+        rise: at the ends of the interval.
+    """
+    cells, mass = _density(parameter, values, rises)
+    by_mass = float(mass[cells <= rise].sum() / mass.sum()) if len(cells) else 1.0
+    return min(float(chdtr(1, 2 * rise)), by_mass)
+
+
+def _density(
+    parameter: FreeParameter,
+    values: Float[np.ndarray, " points"],
+    rises: Float[np.ndarray, " points"],
+) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
+    """Rise and probability of small cells along a profile, up to a factor."""
+    fractions = np.clip(to_fractions(parameter, values), EDGE, 1 - EDGE)
+    u = np.log(fractions / (1 - fractions))  # in which the prior is a density
+    middles = (np.arange(CELLS) + 0.5) / CELLS
+    roots = np.sqrt(np.maximum(rises, 0.0))  # linear along a parabola
+    between = roots[:-1, None] + np.diff(roots)[:, None] * middles
+    cells = between.ravel() ** 2
+    return cells, np.exp(-cells) * np.repeat(np.diff(u) / CELLS, CELLS)

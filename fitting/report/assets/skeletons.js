@@ -1,4 +1,4 @@
-// Unpacks what fitting/report/page/motion_data.py has packed.
+// Unpacks what fitting/report/motion_data.py has packed.
 
 const FADE = 0.3; // m inside its edge, for an adult, over which the ground appears
 

@@ -1,37 +1,170 @@
 """From clips, and whatever ground and animations there are for them, to a first experiment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 import jaxik
-from fitting.analysis import playback
-from fitting.analysis.goodness import distances
-from fitting.analysis.goodness.distances import Distances
-from fitting.analysis.goodness.verdict import describe_setback
-from fitting.datasets.clips import Clip, edit, load_clip
-from fitting.datasets.clips.load import AS_FOUND, ClipOptions
-from fitting.datasets.terrain.mesh_files import TerrainOptions
-from fitting.datasets.terrain.reconstruction import Reconstruction, reconstruct
-from fitting.experiments.experiment import ClipEntry, Experiment
-from fitting.experiments.problems import ClipData, load_clip_data, problem_from_clips
-from fitting.experiments.record_only import PLACES
-from fitting.experiments.systems import DEFAULT_PRESET, Preset, preset_system
-from fitting.inference.choice import Forecast, choose_free
-from fitting.inference.harmless import leave_alone
-from fitting.inference.sensitivity import FreeTable, all_parameters
+from fitting.clips import Clip, edit, flight, load_clip, summary
+from fitting.clips.load import AS_FOUND, ClipOptions
+from fitting.clips.rigs import USUAL_ERROR, measure_soles
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.problems import ClipData, load_clip_data, problem_from_clips
+from fitting.experiment.record_files import PLACES
+from fitting.experiment.systems import DEFAULT_PRESET, Preset, preset_system
+from fitting.ground import coverage
+from fitting.ground.meshes import TerrainOptions
+from fitting.ground.reconstruction import Reconstruction, reconstruct
+from fitting.inference.sensitivity import (
+    Forecast,
+    FreeTable,
+    all_parameters,
+    choose_free,
+    leave_alone,
+)
+from fitting.motion import goodness, playback
+from fitting.motion.goodness import Distances, describe_setback
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from fitting.studies.motions import capture_check
-from fitting.studies.motions.capture_check import CaptureCheck
+from fitting.studies.fit import capture_check
+from fitting.studies.fit.capture_check import CaptureCheck, stances_of
+from jaxik.world import body
 
-from .assumptions import Assumption, of_clip
+FEW_STANCES = 6  # of a foot
+SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together
+
 
 EXPERIMENT = "experiment.toml"
 FAST, SLOW = 45.0, 30.0  # Hz: clips above the one are resampled to the other, which is enough
 HARM = "{} as it comes does not leave these feet alone, as it must on flat ground: {}"
 SHORTEST = 0.1  # s that is worth cutting off an end without motion
+
+
+class Assumption(NamedTuple):
+    """Something taken for granted."""
+
+    topic: str
+    text: str
+    """What is assumed, and from what."""
+    advice: str = ""
+    """What to check or to do better; empty where the clip bears it out."""
+
+
+def of_clip(
+    data: ClipData,
+    ground: Reconstruction | None,
+    *,
+    base_is_own: bool,
+    sole_is_given: bool = False,
+) -> list[Assumption]:
+    """The assumptions about one clip of an experiment.
+
+    Args:
+        data: the loaded clip.
+        ground: what the terrain was reconstructed from; None for a terrain that was given.
+        base_is_own: whether the flat animation was given, and not made from the capture.
+        sole_is_given: whether heights over the sole were given, and not measured or estimated.
+    """
+    return [
+        *_body(data.reference),
+        *_legs(data.reference),
+        _soles(data.reference, is_given=sole_is_given),
+        *_ground(data, ground),
+        _base(data, base_is_own=base_is_own),
+    ]
+
+
+def _body(clip: Clip) -> Iterator[Assumption]:
+    length = body.leg_length(clip.rig)
+    text = f"{clip.scale:.6g} m per unit of the file, {clip.up_axis} up: legs {length:.2f} m long"
+    yield Assumption("body", text)
+    for remark in clip.remarks:
+        yield Assumption("file", remark, "see `jaxik inspect`")
+    if text := flight.describe(clip):
+        yield Assumption("air", text)
+
+
+def _legs(clip: Clip) -> Iterator[Assumption]:
+    described = summary.describe(clip)
+    for leg, name in enumerate(clip.rig.names):
+        bend = knee_bend(clip)[:, leg]
+        low, high = np.degrees(np.percentile(bend, [1, 99]))
+        text = f"the {name} knee bends by {low:.0f}° to {high:.0f}°"
+        yield Assumption("knees", text)
+    for name, leg in described["legs"].items():
+        text = f"the {name} foot {summary.contact_text(described, leg)}"
+        few = leg["contacts"] < FEW_STANCES
+        yield Assumption(
+            "contacts", text, "few steps determine little: take a longer clip" if few else ""
+        )
+
+
+def _soles(clip: Clip, *, is_given: bool) -> Assumption:
+    """How high balls are over their soles, which shifts reconstructed ground, and how sure."""
+    heights = np.asarray(clip.rig.ball_height)
+    text = f"balls are {100 * heights.mean():.1f} cm over their soles"
+    if is_given:
+        return Assumption("soles", f"{text}, as was given")
+    labels = clip.stance_labels()
+    soles = measure_soles(clip.rig, clip.positions_ws, clip.rotations_ws, labels)
+    if soles.measured.all():
+        spread = 100 * np.ptp(heights) / 2
+        text += f", measured over the level floor at height 0 (feet differ by ±{spread:.1f} cm)"
+        return Assumption("soles", text)
+    return Assumption(
+        "soles",
+        f"{text}, estimated from the feet's length, give or take {100 * USUAL_ERROR:.0f} cm",
+        "better: measure it, and give it as --sole",
+    )
+
+
+def knee_bend(clip: Clip) -> Float[np.ndarray, "frames legs"]:
+    """Angle between thigh and shin, rad: 0 in a straight leg."""
+    hip, knee, ankle = (clip.joints_ws(role) for role in range(3))
+    thigh, shin = knee - hip, ankle - knee
+    lengths = np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shin, axis=-1)
+    cosines = np.sum(thigh * shin, axis=-1) / np.maximum(lengths, 1e-12)
+    return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumption]:
+    stances = stances_of(data)
+    covered = ~np.isnan(stances.ground)
+    if ground is not None:
+        error = 100 * ground.predictions[ground.chosen].rms
+        text = (
+            f"reconstructed from {int(ground.stances.used.sum())} stances ({ground.chosen}); each "
+            f"is predicted from the others to {error:.1f} cm (rms)"
+        )
+        doubt = "it is not to be trusted; " if 100 * SCATTER < error else ""
+        yield Assumption("ground", text, f"{doubt}better: a scan of the ground, with --terrain")
+    elif not covered.any():
+        yield Assumption("ground", "no foot stands on it", "better: a clip in which the feet stand")
+        return
+    else:
+        gap = (stances.sole - stances.ground)[covered]
+        text = (
+            f"below {covered.mean():.0%} of the stances; soles stand {100 * np.median(gap):.1f} cm "
+            f"above it, give or take {100 * np.std(gap):.1f} cm"
+        )
+        advice = "does this ground belong to this clip?"
+        fits = covered.mean() >= coverage.ENOUGH and np.std(gap) < SCATTER
+        yield Assumption("ground", text, "" if fits else advice)
+
+
+def _base(data: ClipData, *, base_is_own: bool) -> Assumption:
+    if base_is_own:
+        return Assumption("base", f"{data.base.source}; its root {data.root.reason}")
+    return Assumption(
+        "base",
+        "made from the capture, with the ground taken out from under the feet",
+        "better: the flat animation that the game plays, with --base",
+    )
 
 
 @dataclass(frozen=True)
@@ -184,7 +317,7 @@ def draft(
     check = capture_check.check(data)
     with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
         as_it_comes = playback.play_all(ik, problem_from_clips(experiment, data).data)
-    apart = distances.measure(as_it_comes, as_it_comes)
+    apart = goodness.measure_distances(as_it_comes, as_it_comes)
     lines: list[str] = []
     if check.flat:
         moved = _decisive(experiment, data, candidates) if apart.setbacks else []
@@ -223,7 +356,7 @@ def _decisive(experiment: Experiment, data: Sequence[ClipData], candidates: Free
 
     def is_harmless(ik: jaxik.FootIK) -> bool:
         played = playback.play_all(ik, scenes)
-        return not distances.measure(played, played).setbacks
+        return not goodness.measure_distances(played, played).setbacks
 
     ik = experiment.starting_system(data[0].base.rig)
     with activity.announced("Looking for what leaves the feet alone"):

@@ -20,11 +20,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 import jaxik
-from fitting.experiments.experiment import Experiment
-from fitting.experiments.experiment_files import load_experiment
-from fitting.experiments.problems import make_problem
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.problems import make_problem
 from fitting.inference.sharding import EVERYWHERE, specifications
-from fitting.problem import stacking
+from fitting.problem import shared_world
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
@@ -125,7 +125,7 @@ def evaluate_many(
     results: dict[str, np.ndarray] = {}
     done = 0
     with activity.announced(f"Running {count} systems on {len(scenes)} clips", count) as running:
-        for stack in stacking.stack(scenes):
+        for stack in shared_world.stack(scenes):
             calls = _Calls(ik_batch, count, stack, measure, mesh, chunk, memory)
             for cells, values in calls.results():
                 for name, value in values.items():
@@ -143,7 +143,7 @@ class _Calls:
 
     ik_batch: jaxik.FootIK
     count: int
-    stack: stacking.Stack
+    stack: shared_world.Stack
     measure: Measure
     mesh: Mesh
     chunk: int | None
@@ -188,8 +188,8 @@ class _Calls:
         else:
             systems = np.minimum(np.arange(start, start + size), self.count - 1)
             clips, stacked = self.stack.one(fixed), (self._varies, None)
-        ik = stacking.chosen(self.ik_batch, self._varies, systems)
-        ik = stacking.chosen(ik, [not flag for flag in self._varies], 0)
+        ik = shared_world.chosen(self.ik_batch, self._varies, systems)
+        ik = shared_world.chosen(ik, [not flag for flag in self._varies], 0)
         return self.measure, self.mesh, stacked, ik, clips
 
     @functools.cached_property
@@ -237,7 +237,7 @@ def _along(
         scene: clips.
     """
     arguments = tuple(zip((ik, scene), stacked, strict=True))
-    in_axes = tuple(flags and stacking.labelled(tree, flags, 0) for tree, flags in arguments)
+    in_axes = tuple(flags and shared_world.labelled(tree, flags, 0) for tree, flags in arguments)
     split = PartitionSpec(BATCH)
     specs = tuple(
         specifications(tree, flags, split) if flags else EVERYWHERE for tree, flags in arguments

@@ -1,1 +1,0 @@
-"""Goodness of fit: what the residuals say of the fit, and of the noise that was assumed."""

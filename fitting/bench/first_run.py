@@ -1,0 +1,108 @@
+"""What a newcomer waits for: a first fit, a first posterior, the first cells of a notebook.
+
+`python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
+folder, as a command or a notebook would, and prints the seconds until the first number and until
+the end.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .measurement import FigureSpec, Measurement
+from .workloads import Sizes
+
+EXAMPLE, RUN = "uneven_walk", "run"  # the main job of the README, and the folder of its run
+ENDS = {"empty": 50.0, "full": 15.0}  # s, aims of the whole job by what the cache holds
+WAITS = {
+    "notebook": "a notebook's first heights of feet",
+    "fit": "`jaxik fit`, its first cost",
+    "sample": "`jaxik sample`, its first state of the chain",
+}
+
+
+def first_run(measurement: Measurement, sizes: Sizes) -> None:
+    """Processes that begin with an empty cache and with a full one."""
+    from fitting.studies import exports
+
+    for number in range(sizes.fits):
+        with tempfile.TemporaryDirectory() as parent:
+            exports.copy(EXAMPLE, folder := Path(parent, EXAMPLE), "{}")
+            for state in ENDS:
+                for kind in WAITS:
+                    name = f"{kind}, {state} cache"
+                    measurement.progress(f"first: {name}, run {number + 1} of {sizes.fits}")
+                    seconds = _in_process(kind, folder, {"XDG_CACHE_HOME": f"{parent}/{kind}"})
+                    measurement.samples.setdefault(name, []).append(seconds["first"])
+                    if kind == "fit":
+                        measurement.samples.setdefault(f"whole {name}", []).append(seconds["end"])
+    for state, at_most in ENDS.items():
+        for kind, what in WAITS.items():
+            spec = FigureSpec(what=f"{what}, {state} cache", unit="s")
+            measurement.add_timing(f"{kind}, {state} cache", spec)
+        spec = FigureSpec(what=f"… the whole fit, {state} cache", unit="s", at_most=at_most)
+        measurement.add_timing(f"whole fit, {state} cache", spec)
+
+
+def _in_process(kind: str, folder: Path, variables: dict[str, str]) -> dict[str, float]:
+    """Seconds of a new process until its first number and its end, imports included."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    command = [sys.executable, "-m", "fitting.bench.first_run", kind, str(folder)]
+    start = time.time()
+    finished = subprocess.run(
+        command, env=environment | variables, check=True, capture_output=True, text=True
+    )
+    first = float(json.loads(finished.stdout.splitlines()[-1]))
+    return {"first": first - start, "end": time.time() - start}
+
+
+def fit(folder: Path, reached: Callable[..., Any]) -> None:
+    """The whole job; its first number is a cost."""
+    import fitting
+
+    shutil.rmtree(folder / RUN, ignore_errors=True)
+    fitting.fit(folder / f"{EXAMPLE}.toml", folder / RUN, progress=reached)
+
+
+def sample(folder: Path, reached: Callable[..., Any]) -> None:
+    """Steps around the fit that is there until the first report on the chain."""
+    import fitting
+    from fitting.inference.sample.blocks import SamplerSettings
+
+    fitting.sample(folder / RUN, max_steps=SamplerSettings().check_every, progress=reached)
+
+
+def notebook(folder: Path, reached: Callable[..., Any]) -> None:
+    """What a notebook begins with: a clip on its ground, a preset, how high the feet are."""
+    import jaxik
+    from fitting.experiment.experiment_files import load_experiment
+    from fitting.experiment.problems import make_problem
+    from fitting.motion import playback
+
+    problem = make_problem(load_experiment(folder / f"{EXAMPLE}.toml"))
+    (scene,) = problem.data
+    result = playback.run(jaxik.presets.record(), scene)
+    reached(float(result.pose.ankle.pos[..., 1].mean()))
+
+
+def main() -> None:
+    """Does one of the jobs and prints the time of its first number, in seconds since 1970."""
+    from fitting.runtime import cache_folder, xla
+
+    xla.configure_xla()
+    cache_folder.use_default()
+    times: list[float] = []
+    jobs = {"fit": fit, "sample": sample, "notebook": notebook}
+    jobs[sys.argv[1]](Path(sys.argv[2]), lambda *_: times.append(time.time()))
+    print(f"\n{times[0]}")
+
+
+if __name__ == "__main__":
+    main()

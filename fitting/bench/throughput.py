@@ -1,0 +1,475 @@
+"""Many systems, clips and fits: time and memory against devices, clips and workers.
+
+Each point is a process of its own, so that its peak of memory is its own, too:
+`python -m fitting.bench.throughput WHAT COUNT` prints its numbers as JSON. Devices are those
+of this machine, or simulated ones, which share its cores: they show what sharing costs.
+"""
+
+import dataclasses
+import functools
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+import jaxik
+from fitting.clips import edit
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.experiment.problems import ClipData
+from fitting.experiment.systems import Preset
+from fitting.runtime.cluster import Stopwatch, peak_mb
+from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
+from fitting.viewer import Solver, Subject, Take, knobs
+from fitting.viewer.subject import DEFAULT, cost_of_problem
+from jaxik.world import terrain
+from jaxik.world.terrain import Terrain, plane
+
+from . import fits, kernels, workloads
+from .measurement import (
+    Call,
+    Figure,
+    FigureSpec,
+    Measurement,
+    Series,
+    peak_memory_mb,
+    reset_peak_memory,
+    time_in_width,
+)
+from .roofline import Work
+from .workloads import Crowd, Member, Sizes
+
+FRAMES = 60
+LENGTHS = 33, 50  # frames of the shortest and of the longest of many clips
+SYSTEMS = 4096  # shared out among devices
+FITS = 8  # shared out among workers
+LONGEST = (
+    300.0  # s of a point, compiling included, after which larger ones of its curve are left out
+)
+SIMULATED = "--xla_force_host_platform_device_count={}"
+EXPERIMENT = """
+preset = "record"
+faithful = true
+[[clips]]
+reference = "reference.npz"
+base = "base.npz"
+terrain = "ground.ply"
+[free]
+pelvis.on_gain = {}
+foot.max_pitch = { low = 0.1 }
+[fit]
+starts = 1
+"""
+
+BLOCK = 3  # frames at once, whose arrays fit the cache nearest to a core
+
+REPEATS = 3  # of each point
+RAYS = 100_000  # against terrains of any size
+TAIL = 3  # points, over which the slope at the largest sizes is taken
+Point: TypeAlias = Mapping[str, float]  # seconds by name of the curve
+
+RATE = 30.0  # Hz, of the clip
+TARGET = 100.0  # ms, from which a drag feels slow
+DRAGS = 50  # different ones, of any number
+
+
+def many(measurement: Measurement, sizes: Sizes) -> None:
+    """Time and peak of memory against devices, clips and workers."""
+    sharing = 2 * usable_cores()
+    _vary(measurement, "devices", sizes.devices, f"{SYSTEMS} systems", sharing)
+    _vary(measurement, "clips", sizes.clips, "a system")
+    _vary(measurement, "workers", sizes.workers, f"{FITS} fits", sharing)
+    measurement.notes.append(
+        "devices are simulated where there is one: they share its cores, so that time should stay; "
+        "seconds are those after compiling, of workers those of all, starting them included; the "
+        "peak of workers is the largest of one process, and every peak includes compiling"
+    )
+
+
+def _vary(
+    measurement: Measurement, what: str, counts: Sequence[int], curve: str, most: float = math.inf
+) -> None:
+    """Adds a series with the memory peak of each point.
+
+    What is left out, and why, is a note: more than `most`, which would share the same cores, and
+    whatever is larger than a point that took long or failed.
+    """
+    series = Series(what, [], {})
+    measurement.series.append(series)
+    result = ""
+    for index, count in enumerate(counts):
+        if count > most:
+            _leave_out(measurement, what, counts[index:], "two share each core already")
+            return
+        measurement.progress(f"many: {count} {what}, {index + 1} of {len(counts)}{result}")
+        began = time.monotonic()
+        try:
+            point = _measured(what, count)
+        except subprocess.CalledProcessError as error:
+            last = (error.stderr or "").strip().rpartition("\n")[2]
+            measurement.failures.append(f"{count} {what}: {last or error}")
+            _leave_out(measurement, what, counts[index + 1 :], f"{count} failed")
+            return
+        series.sizes.append(count)
+        label = f"{curve}, {count} {what}"
+        for name, key in (("", "seconds"), (": CPU time", "cpu_seconds")):
+            series.seconds.setdefault(f"{curve}{name}", []).append(point[key])
+            measurement.add(Figure(f"{label}{name}", point[key], "s"))
+        measurement.add(Figure(f"{label}: peak of memory", point["peak_mb"], "MB"))
+        result = f"; {count}: {point['seconds']:.2g} s"
+        if (took := time.monotonic() - began) > LONGEST:
+            _leave_out(measurement, what, counts[index + 1 :], f"{count} took {took:.0f} s")
+            return
+
+
+def _leave_out(measurement: Measurement, what: str, counts: Sequence[int], why: str) -> None:
+    if counts:
+        measurement.notes.append(f"left out: {', '.join(map(str, counts))} {what}, as {why}")
+
+
+def _measured(what: str, count: int) -> Mapping[str, float]:
+    """The numbers of a point, of a process of its own.
+
+    Raises:
+        subprocess.CalledProcessError: it has failed.
+    """
+    environment = os.environ | ({"XLA_FLAGS": _flags(count)} if what == "devices" else {})
+    finished = subprocess.run(
+        [sys.executable, "-m", "fitting.bench.throughput", what, str(count)],
+        env=environment, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return json.loads(finished.stdout.splitlines()[-1])
+
+
+def _flags(devices: int) -> str:
+    """The flags of this process with simulated devices."""
+    return f"{os.environ.get('XLA_FLAGS', '')} {SIMULATED.format(devices)}".strip()
+
+
+def of_devices(count: int) -> dict[str, float]:
+    """Many systems on a clip, on so many devices."""
+    import jax
+
+    import fitting
+
+    problem = workloads.problem(FRAMES)
+    ik = problem.space.unpack(problem.space.start)
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.05, 0.9, SYSTEMS)})
+    devices = jax.local_devices()[:count]
+    return _second_time(lambda: fitting.evaluate_many(batch, problem.data, devices=devices))
+
+
+def of_clips(count: int) -> dict[str, float]:
+    """A system on so many clips of different length on one ground."""
+    import fitting
+
+    problem = workloads.problem(max(LENGTHS))
+    ik = problem.space.unpack(problem.space.start)
+    lengths = np.linspace(*LENGTHS, count).astype(int)
+    clips = [workloads.first_frames(problem.data[0], length) for length in lengths]
+    single = fitting.vary(ik, {"pelvis.on_gain": [0.2]})
+    return _second_time(lambda: fitting.evaluate_many(single, clips))
+
+
+def of_workers(count: int) -> dict[str, float]:
+    """Fits of a clip with several seeds, on so many workers of this machine."""
+    import fitting
+    from fitting.clips import save_clip
+    from fitting.ground.meshes import save_mesh
+    from fitting.runtime import cache_folder
+
+    cache_folder.use_default()
+    with tempfile.TemporaryDirectory() as folder:
+        reference, base, ground = workloads.recording(FRAMES)
+        save_clip(Path(folder, "reference.npz"), reference)
+        save_clip(Path(folder, "base.npz"), base)
+        save_mesh(Path(folder, "ground.ply"), ground.vertices, ground.faces)
+        path = Path(folder, "walk.toml")
+        path.write_text(EXPERIMENT, encoding="utf-8")
+        fitting.fit_many(path, Path(folder, "first"), workers=1, report=False)  # compiles
+        began = time.monotonic()
+        fits = fitting.fit_many(path, Path(folder, "fits"), seeds=FITS, workers=count, report=False)
+        efforts = [row["effort"] for row in fits.finished if "effort" in row]
+        return {
+            "seconds": time.monotonic() - began,
+            "cpu_seconds": sum(effort["cpu_seconds"] for effort in efforts),
+            "peak_mb": max(effort["peak_mb"] or float("nan") for effort in efforts),
+        }
+
+
+def _second_time(call: Callable[[], object]) -> dict[str, float]:
+    """What a call takes after one that compiles; the peak is that of both."""
+    call()
+    watch = Stopwatch()
+    call()
+    effort = watch.read()
+    return {
+        "seconds": effort["seconds"],
+        "cpu_seconds": effort["cpu_seconds"],
+        "peak_mb": peak_mb() or float("nan"),
+    }
+
+
+POINTS = {"devices": of_devices, "clips": of_clips, "workers": of_workers}
+
+
+def main() -> None:
+    """Measures one point and prints it."""
+    import jax
+
+    import fitting
+
+    fitting.configure_xla()
+    jax.config.update("jax_enable_x64", True)
+    what, count = sys.argv[1:]
+    print(json.dumps(POINTS[what](int(count))))
+
+
+class CrowdScene(NamedTuple):
+    """A crowd on its ground, computed `chunk` characters at a time."""
+
+    crowd: Crowd
+    ground: Terrain
+    chunk: int
+
+
+def forward(crowd: Crowd, ground: Terrain, member: Member) -> tuple:
+    """What a game takes over of one character: corrections, the body's motion, what was reached."""
+    ik, frames = crowd.character(member)
+    return _outputs(ik, crowd, ground, frames)
+
+
+def _outputs(ik: jaxik.FootIK, crowd: Crowd, ground: Terrain, frames: jaxik.Frame) -> tuple:
+    result = jaxik.run(ik, crowd.rig, ground, frames, block=cpu_block(BLOCK))
+    return result.corrections, result.body, result.reached
+
+
+def _loss(ik: jaxik.FootIK, crowd: Crowd, ground: Terrain, frames: jaxik.Frame) -> jax.Array:
+    """A number that depends on all of a character's outputs."""
+    squares = [jnp.sum(leaf**2) for leaf in jax.tree.leaves(_outputs(ik, crowd, ground, frames))]
+    return functools.reduce(jnp.add, squares)
+
+
+def reverse(crowd: Crowd, ground: Terrain, member: Member) -> tuple:
+    """One character's loss and its gradient with respect to all parameters of its system."""
+    ik, frames = crowd.character(member)
+    return eqx.filter_value_and_grad(_loss)(ik, crowd, ground, frames)
+
+
+def in_chunks(
+    measurement: Measurement, name: str, function: Callable, scene: CrowdScene
+) -> Callable[[], list[PyTree]]:
+    """A call that computes a crowd in chunks, as many at a time as there are cores.
+
+    All chunks use one program: its workspace, times the cores, is what a crowd of any size needs.
+
+    Args:
+        measurement: keeps the program's compile time and work.
+        name: under which it keeps them.
+        function: of a crowd, a ground and one member.
+        scene: the crowd and its ground.
+    """
+    crowd, ground, chunk = scene
+    count = crowd.first.size
+    chunk = min(chunk, count)
+    # The last chunk overlaps the one before, so that all have one shape.
+    starts = [min(first, count - chunk) for first in range(0, count, chunk)]
+    members = [
+        jax.tree.map(lambda leaf: leaf[first : first + chunk], crowd.members)  # noqa: B023
+        for first in starts
+    ]
+    shared = dataclasses.replace(
+        crowd, drawn={}, place_ws=crowd.place_ws[:0], first=crowd.first[:0]
+    )
+
+    def of_chunk(shared: Crowd, ground: Terrain, members: Member) -> PyTree:
+        return jaxik.lanes(lambda member: function(shared, ground, member), out_axes=-1)(members)
+
+    program = measurement.compile(name, of_chunk, shared, ground, members[0], sparse=ground)
+    measurement.work[name] = measurement.work[name] * len(members)
+    calls = [functools.partial(program, shared, ground, part) for part in members]
+    return functools.partial(on_all_cores, calls)
+
+
+def crowd(measurement: Measurement, sizes: Sizes) -> None:
+    """The whole pipeline for a crowd, on a plane and on a mesh."""
+    people = workloads.crowd(sizes.characters, sizes.frames)
+    count = sizes.characters * sizes.frames * people.rig.side.size
+    mesh = workloads.ground(workloads.mesh_field(sizes.cells))
+    grounds = {"plane": (workloads.single(plane()), 9.0), "mesh": (mesh, 5.0)}
+    calls = {
+        name: in_chunks(measurement, name, forward, CrowdScene(people, ground, sizes.chunk))
+        for name, (ground, _) in grounds.items()
+    }
+    reset_peak_memory()
+    measurement.time_in_turns(calls, sizes.crowd_repeats)
+    peak = peak_memory_mb()
+    work = measurement.work
+    for name, (_, target) in grounds.items():
+        what = f"{name}, leg-frames a second"
+        measurement.add_timing(name, _leg_frames(what, count, work[name], target / time_in_width()))
+    note = "all results of the crowd are kept"
+    measurement.add(Figure("peak of memory", peak, "MB", note=note))
+
+
+def gradient(measurement: Measurement, sizes: Sizes) -> None:
+    """The gradient for each member's parameters, against the forward run."""
+    people = workloads.crowd(sizes.derived, sizes.frames)
+    count = sizes.derived * sizes.frames * people.rig.side.size
+    scene = CrowdScene(people, workloads.single(plane()), sizes.chunk)
+    calls = {
+        name: in_chunks(measurement, name, function, scene)
+        for name, function in (("forward", forward), ("reverse", reverse))
+    }
+    reset_peak_memory()
+    measurement.time_in_turns(calls, sizes.crowd_repeats)
+    peak, work = peak_memory_mb(), measurement.work
+    operations = work["reverse"].operations / work["forward"].operations
+    note = f"{sizes.derived} characters; by operations {operations:.1f} times"
+    ratio = FigureSpec(what="reverse in forward runs", at_most=4.0, note=note)
+    measurement.add_ratio("reverse", "forward", ratio)
+    rate = _leg_frames("leg-frames a second", count, work["reverse"])
+    measurement.add_timing("reverse", rate)
+    measurement.add(Figure("peak of memory", peak, "MB"))
+
+
+def _leg_frames(what: str, count: int, work: Work, at_least: float | None = None) -> FigureSpec:
+    """The figure of leg-frames per second, where `count` leg-frames are this work."""
+    return FigureSpec(
+        what=what, unit="M", scale=1e-6 * count, rate=True, threads=usable_cores(),
+        at_least=at_least,
+        note=f"{work.operations / count:.0f} operations and {work.moved / count:.0f} bytes a "
+        f"leg-frame; workspace of a chunk {work.workspace / 1e6:.0f} MB",
+    )  # fmt: skip
+
+
+def scaling(measurement: Measurement, sizes: Sizes) -> None:
+    """Time against legs, frames, legs of a character, parameters and triangles."""
+    clip = workloads.walk(sizes.frames)
+    rig, motion = workloads.single(clip.rig), workloads.single(frames_from_clip(clip))
+    ik, flat = workloads.single(jaxik.presets.record(faithful=True)), workloads.single(plane())
+
+    def legs(count: int) -> Point:
+        batch = workloads.leg_batch(count)
+        name = f"{count} legs"
+        call = measurement.compile_call(name, kernels.leg_corrections, batch.ik, batch.lanes)
+        return {"two-bone legs": _median(measurement, name, call)}
+
+    def frames(count: int) -> Point:
+        name, tiled = f"{count} frames", workloads.tiled(motion, count)
+        call = measurement.compile_call(name, run, ik, rig, flat, tiled)
+        return {"run, a character": _median(measurement, name, call)}
+
+    def legs_each(count: int) -> Point:
+        name = f"{count} legs each"
+        many_rig, many_motion = workloads.with_legs(rig, motion, count)
+        call = measurement.compile_call(name, run, ik, many_rig, flat, many_motion)
+        return {"run, a character": _median(measurement, name, call)}
+
+    def parameters(count: int) -> Point:
+        name, names = f"{count} parameters", workloads.parameter_names(count)
+        with jax.enable_x64(True):
+            problem = workloads.problem(sizes.frames, names)
+            call = measurement.compile_call(
+                name, fits.residuals_and_jacobian, problem, problem.space.start
+            )
+            return {"rows and slopes, float64": _median(measurement, name, call)}
+
+    def triangles(count: int) -> Point:
+        mesh, name = workloads.mesh_field(round((count / 2) ** 0.5)), f"{count} triangles"
+        measurement.progress(f"scaling: grid of {name}")
+        start = time.perf_counter()
+        ground = jax.block_until_ready(workloads.ground(mesh))
+        seconds = time.perf_counter() - start
+        origins = jnp.asarray(workloads.ray_origins(min(RAYS, sizes.rays)))
+        call = measurement.compile_call(name, kernels.cast_down, ground, origins)
+        median = _median(measurement, name, call)
+        return {f"{len(origins)} rays": median, "build the grid": seconds}
+
+    triangle_counts = [2 * cells**2 for cells in sizes.grids]
+    _varied_by_core(measurement, "legs in a batch", sizes.batches, legs)
+    _varied_by_core(measurement, "frames", sizes.lengths, frames)
+    _varied_by_core(measurement, "legs of a character", sizes.legs_each, legs_each)
+    _varied_by_core(measurement, "free parameters", sizes.parameters, parameters)
+    _varied_by_core(measurement, "triangles", triangle_counts, triangles)
+
+
+def _varied_by_core(
+    measurement: Measurement, size: str, values: Iterable[int], measure: Callable[[int], Point]
+) -> None:
+    """Adds a series, point by point, so that measured points survive an interrupt."""
+    series = Series(size, [], {})
+    measurement.series.append(series)
+    for value in values:
+        point = measure(value)
+        series.sizes.append(value)
+        for name, seconds in point.items():
+            series.seconds.setdefault(name, []).append(seconds)
+    for name, seconds in series.seconds.items():
+        if len(seconds) > 1:
+            tail = min(TAIL, len(seconds))
+            note = f"{series.slope(name, TAIL):.2f} over the {tail} largest"
+            what = f"{name} against {size}"
+            measurement.add(Figure(what, series.slope(name), "slope", note=note))
+
+
+def _median(measurement: Measurement, name: str, call: Call) -> float:
+    return measurement.time_in_turns({name: call}, REPEATS)[name]
+
+
+def run(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Terrain, motion: jaxik.Frame) -> tuple:
+    """What a game takes over of one character."""
+    result = jaxik.run(ik, rig, ground, motion)
+    return result.corrections, result.body, result.reached
+
+
+def subject(frame_count: int) -> Subject:
+    """A recording at 30 Hz of so many frames at 60 Hz, with the cost of twenty parameters."""
+    reference, base, mesh = workloads.recording(frame_count)
+    reference, base = (edit.resample(clip, RATE) for clip in (reference, base))
+    data = ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces))
+    problem = workloads.problem_from_clips([data])
+    take = Take("walk", base, data.terrain, problem.data[0].frames, captured=reference)
+    cost = functools.partial(cost_of_problem, problem)
+    starts = {DEFAULT: problem.space.system}
+    return Subject("walk", (take,), starts, Preset("record", faithful=True), cost=cost)
+
+
+def drag(measurement: Measurement, sizes: Sizes) -> None:
+    """Solves a clip of 10 s again for other values: motion, feet, overlays and cost."""
+    walk = subject(sizes.frames)
+    solver, ik = Solver(walk), walk.starts[DEFAULT]
+    measurement.progress("view: compiling solve")
+    start = time.perf_counter()
+    solver.solve(ik)
+    measurement.compile_s["solve"] = time.perf_counter() - start
+    random = np.random.default_rng(0)
+    numbers = [knob for knob in knobs(ik, walk.rig) if not knob.is_switch]
+    chosen = [numbers[i] for i in random.integers(len(numbers), size=DRAGS)]
+    drags = itertools.cycle([(knob, float(random.uniform(knob.low, knob.high))) for knob in chosen])
+
+    def solve() -> None:
+        knob, value = next(drags)
+        solver.solve(knob.write(ik, value))
+
+    measurement.time_in_turns({"drag": solve})
+    seconds = solver.take.base.seconds
+    what = f"a drag, {seconds:.0f} s at {RATE:g} Hz"
+    spec = FigureSpec(what=what, unit="ms", scale=1e3, at_most=TARGET)
+    measurement.add_timing("drag", spec)
+
+
+if __name__ == "__main__":
+    main()

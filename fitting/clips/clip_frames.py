@@ -1,0 +1,254 @@
+"""Conversion between clips and the foot IK pipeline: `Clip` to `Frame`, and `Result` to `Clip`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float64
+from scipy.spatial.transform import Rotation
+
+import jaxik
+from jaxik.world.frame import UP, Stride
+
+from . import contacts
+from .clip import Clip, local_from_world
+from .flight import grounded_track
+from .joint_maps import find_trunk
+
+Direction = Sequence[float] | np.ndarray
+
+
+def frames_from_clip(
+    clip: Clip,
+    *,
+    floor: float = 0.0,
+    up_ws: Direction = UP,
+    rise: Float64[np.ndarray, " frames"] | None = None,
+    stride_scale: float | None = None,
+) -> jaxik.Frame:
+    """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
+
+    Foot IK is at full weight, there are no platforms, and the character slides where the clip
+    says so. Strides follow from the clip's contact labels. After a teleport (`Clip.cuts`) memory,
+    speeds and strides start anew. Numbers are in JAX's default precision.
+
+    Args:
+        clip: with legs.
+        floor: height of the floor on which the clip was animated, m; the origin of model space.
+        up_ws: unit normal of that floor; for a climber, the wall's.
+        rise: how far the character is raised along it in each frame, m; see `ground_path`. Speeds
+            stay those of the animation on its floor.
+        stride_scale: by which strides are to be scaled, where the clip's root is as much faster
+            than its feet step (`clips.edit.at_speed`); None leaves them as animated.
+
+    Raises:
+        ValueError: the clip has no legs.
+    """
+    world = clip.world_from_model(floor, up_ws)
+    pose = _model_from_world(world, clip.leg_pose_ws())
+    legs = len(clip.rig.joints)
+    dtype = world.pos.dtype
+    balls = clip.joints_ws(3)
+    moved = _scaled_strides(np.asarray(world.pos), balls, up_ws, stride_scale)
+    root_velocity, ankle_velocity, toe_velocity = (
+        np.concatenate([_velocity(positions[piece], clip.fps) for piece in clip.pieces])
+        for positions in (np.asarray(world.pos), clip.joints_ws(2) + moved, balls + moved)
+    )
+    slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
+    weight = np.ones((clip.frame_count, legs)) if clip.weight is None else clip.weight
+
+    def array(values: np.ndarray) -> Array:
+        return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
+
+    labels = clip.stance_labels()
+    strides = [_stride(labels[at], (balls + moved)[at], up_ws) for at in clip.pieces]
+    none = jaxik.Transform(*(array(np.zeros((clip.frame_count, 0, size))) for size in (3, 4)))
+    frames = jaxik.Frame(
+        world_from_model=world,
+        pose=pose,
+        weight=array(weight),
+        grounded=array(grounded_track(clip)),
+        slide=array(slide),
+        velocity_ws=array(root_velocity),
+        foot_speed=array(np.linalg.norm(ankle_velocity, axis=-1)),
+        toe_speed=array(np.linalg.norm(toe_velocity, axis=-1)),
+        stride=Stride(*(array(np.concatenate(parts)) for parts in zip(*strides, strict=True))),
+        dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
+        platforms=none,
+        platforms_before=none,
+        stride_scale=None
+        if stride_scale is None
+        else array(np.full(clip.frame_count, float(stride_scale))),
+        restart=jax.device_put(np.isin(np.arange(clip.frame_count), clip.cuts))
+        if clip.cuts
+        else None,
+    )
+    return frames if rise is None else frames.translated(array(_along(up_ws, rise)))
+
+
+def raised(clip: Clip, rise: Float64[np.ndarray, " frames"] | None, up_ws: Direction = UP) -> Clip:
+    """The clip with the whole character moved along `up_ws` by `rise`, m, in each frame.
+
+    It keeps the contact labels that it has on its floor. None returns the same clip.
+    """
+    if rise is None:
+        return clip
+    moved = clip.with_motion(clip.positions_ws + _along(up_ws, rise)[:, None], clip.rotations_ws)
+    return replace(moved, stance=clip.stance_labels())
+
+
+def _along(up_ws: Direction, distance: np.ndarray) -> Float64[np.ndarray, "frames 3"]:
+    return distance[:, None] * np.asarray(up_ws, np.float64)
+
+
+@jax.jit  # as one program; without it thirty operations are compiled
+@jax.vmap
+def _model_from_world(world: jaxik.Transform, pose_ws: jaxik.LegPose) -> jaxik.LegPose:
+    """Leg poses of each frame in model space."""
+    return pose_ws.transformed(world.inverse())
+
+
+@jax.jit
+@jax.vmap
+def _world_from_model(
+    world: jaxik.Transform, body: jaxik.Transform, pose: jaxik.LegPose
+) -> tuple[jaxik.Transform, jaxik.LegPose]:
+    """The body's displacement and the leg poses of each frame in world space."""
+    return world @ body @ world.inverse(), pose.transformed(world)
+
+
+def _velocity(positions: np.ndarray, fps: float) -> np.ndarray:
+    """Velocity of points (frames, ..., 3) since the previous frame, m/s; the first repeats."""
+    steps = np.diff(positions, axis=0) * fps
+    return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(positions.shape)
+
+
+def _scaled_strides(
+    root_ws: np.ndarray, balls_ws: np.ndarray, up_ws: Direction, scale: float | None
+) -> Float64[np.ndarray, "frames legs 3"] | float:
+    """How far scaled strides move each foot, m: see `jaxik.stages.warp.StrideWarp`."""
+    if scale is None:
+        return 0.0
+    offset = balls_ws - root_ws[:, None]
+    up = np.asarray(up_ws, np.float64)
+    return (scale - 1.0) * (offset - (offset @ up)[..., None] * up)
+
+
+def _stride(
+    stance: Bool[np.ndarray, "frames legs"],
+    balls: Float64[np.ndarray, "frames legs 3"],
+    up_ws: Direction,
+) -> tuple[np.ndarray, ...]:
+    """The fields of a `Stride`, in order; unknown where a foot will not stand any more."""
+    known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
+    last_ws, next_ws, aside_ws = (np.zeros(balls.shape) for _ in range(3))
+    fraction = np.zeros(stance.shape)
+    for leg in np.flatnonzero(stance.any(axis=0)):
+        falls = contacts.footfalls(balls[:, leg], stance[:, leg], up_ws)
+        last_ws[:, leg] = falls.positions_ws[falls.last]
+        next_ws[:, leg] = falls.positions_ws[falls.next]
+        fraction[:, leg] = falls.swing_fraction
+        aside_ws[:, leg] = falls.aside_ws[falls.last]
+    return stance, last_ws, next_ws, fraction, known, aside_ws
+
+
+def clip_from_result(
+    clip: Clip,
+    result: jaxik.Result,
+    *,
+    floor: float = 0.0,
+    up_ws: Direction = UP,
+    rise: Float64[np.ndarray, " frames"] | None = None,
+) -> Clip:
+    """The clip with the motion that the pipeline returned.
+
+    Hips, knees, ankles and toes are the solved ones. Joints below them stay rigid on their parents,
+    and all others move with the body. Where the system bends the spine, its base and the head turn,
+    as far as the skeleton has these joints (`joint_maps.find_trunk`).
+
+    Args:
+        clip: the clip from which `frames_from_clip` made the frames.
+        result: of all its frames.
+        floor: as passed to `frames_from_clip`.
+        up_ws: as passed to `frames_from_clip`.
+        rise: as passed to `frames_from_clip`.
+    """
+    world = clip.world_from_model(floor, up_ws)
+    if rise is not None:
+        world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)
+        clip = raised(clip, rise, up_ws)
+    body, solved = _world_from_model(world, result.body, result.pose)
+    body_rot, body_pos = _rotation(body.rot), np.asarray(body.pos)
+
+    positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
+    solved_joints = {
+        joint: (np.asarray(transform.pos)[:, leg], np.asarray(transform.rot)[:, leg])
+        for leg, joints in enumerate(clip.rig.joints)
+        for joint, transform in zip(
+            joints, (solved.hip, solved.knee, solved.ankle, solved.toe), strict=True
+        )
+    }
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
+    on_legs: set[int] = set(solved_joints)
+    for joint, parent in enumerate(clip.parents):
+        if joint in solved_joints:
+            positions_ws[:, joint], rotations_ws[:, joint] = solved_joints[joint]
+        elif parent in on_legs:
+            on_legs.add(joint)
+            parent_rot = _rotation(rotations_ws[:, parent])
+            offset_ws = parent_rot.apply(positions_ls[:, joint])
+            positions_ws[:, joint] = positions_ws[:, parent] + offset_ws
+            rotations_ws[:, joint] = _wxyz(parent_rot * _rotation(rotations_ls[:, joint]))
+        else:
+            positions_ws[:, joint] = body_pos + body_rot.apply(positions_ws[:, joint])
+            rotations_ws[:, joint] = _wxyz(body_rot * _rotation(rotations_ws[:, joint]))
+    trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
+    if result.corrections.spine is not None and trunk.spine is not None:
+        upright = _rotation(world.rot)
+        turns = {trunk.spine: result.corrections.spine, trunk.head: result.corrections.head}
+        for joint, turn_ms in turns.items():
+            if joint is not None and turn_ms is not None:
+                turn_ws = upright * _rotation(turn_ms) * upright.inv()
+                above = _with_descendants(joint, clip.parents)
+                _turn(turn_ws, positions_ws, rotations_ws, above)
+    return clip.with_motion(positions_ws, rotations_ws)
+
+
+def _with_descendants(joint: int, parents: Sequence[int]) -> list[int]:
+    """A joint and all below it in the tree, itself first."""
+    joints = [joint]
+    for child, parent in enumerate(parents):
+        if parent in joints:
+            joints.append(child)
+    return joints
+
+
+def _turn(
+    turn_ws: Rotation, positions_ws: np.ndarray, rotations_ws: np.ndarray, joints: Sequence[int]
+) -> None:
+    """Turns these joints about the first of them, in place."""
+    pivot = positions_ws[:, joints[0]].copy()
+    for joint in joints:
+        positions_ws[:, joint] = pivot + turn_ws.apply(positions_ws[:, joint] - pivot)
+        rotations_ws[:, joint] = _wxyz(turn_ws * _rotation(rotations_ws[:, joint]))
+
+
+def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:
+    """World positions, m, under the names that the scoring of the `blocks` benchmark reads.
+
+    `pelvis` is (frames, 3); `hip`, `knee`, `ankle` and `ball` are (frames, legs, 3).
+    """
+    roles = ("hip", "knee", "ankle", "ball")
+    positions = {role: clip.joints_ws(index) for index, role in enumerate(roles)}
+    return {"pelvis": clip.positions_ws[:, clip.rig.pelvis], **positions}
+
+
+def _rotation(wxyz: Array | np.ndarray) -> Rotation:
+    return Rotation.from_quat(np.asarray(wxyz, np.float64), scalar_first=True)
+
+
+def _wxyz(rotation: Rotation) -> np.ndarray:
+    return rotation.as_quat(scalar_first=True)

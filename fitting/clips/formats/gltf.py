@@ -1,0 +1,713 @@
+"""Reader of glTF 2.0 and GLB files: skinned characters and plain nodes with an animation.
+
+All nodes above the skeleton, with their rotations, scales and motion, are part of it: positions
+are those of the scene, in metres with y up, as the format has it. Meshes, materials and morph
+targets are not read.
+"""
+
+import base64
+import binascii
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from fitting.clips.clip import FASTEST, SLOWEST, Recording, local_from_world
+from fitting.runtime.validation import error_context, why_unreadable
+
+Item = Mapping[str, Any]
+
+MAGIC = b"glTF"
+JSON, BIN = 0x4E4F534A, 0x004E4942  # kinds of chunks
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COMPONENT_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+LARGEST_COUNT = 2**53
+
+
+WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
+ON_KEY = 1e-5  # s; times that are given with 32 bits are no more exact
+LATEST = 1e6  # s
+USUAL_RATE = 30.0  # Hz, of animations whose keys follow no rate
+RATES = (8.0, 1000.0)  # Hz; keys outside are no frames
+ON_GRID = 0.95  # of the keys, which follow a rate
+OFF_GRID = 0.02  # of a frame; times of files are often rounded to milliseconds
+
+DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}
+FLAT = 1e-6  # of a length; axes that are less apart have no direction of their own
+
+
+SUFFIXES = (".glb", ".gltf")
+PATHS = tuple(WIDTHS)
+MOST_NUMBERS = 1_000_000  # frames times nodes, and keys, of small files; of others their bytes
+
+BINARY = "glb"
+KINDS = (BINARY, "gltf")
+DATA = "data:"  # begins a uri that holds the bytes itself
+JSON_START = 20  # bytes, in the binary form
+
+
+class Document:
+    """A glTF file. Its methods raise ValueError, without the file's name, for what is no glTF."""
+
+    def __init__(self, path: Path):
+        self.folder = path.parent
+        content = path.read_bytes()
+        self.size = len(content)
+        """Bytes of the file, and of the files beside it that were read."""
+        self.binary: bytes | None = None
+        if path.suffix.lower() == f".{BINARY}":
+            content, self.binary = _chunks(content)
+        try:
+            header = json.loads(content.decode("utf-8-sig"))
+        except RecursionError:
+            raise ValueError("its header is nested too deeply") from None
+        except ValueError as error:
+            raise ValueError(f"its header is not JSON: {error}") from None
+        self.header = as_item(header, "the header")
+        self.items = cache(self._items)
+        """A list of the header by its name, empty where there is none."""
+        self._array = cache(self._read_array)
+        self._buffer = cache(self._read_buffer)
+
+    def _items(self, name: str) -> list[Item]:
+        items = as_list(self.header.get(name, []), name)
+        return [as_item(item, f"{name} {index}") for index, item in enumerate(items)]
+
+    def array(self, index: object) -> Float64[np.ndarray, "count width"]:
+        """The values of an accessor; normalised integers have become fractions."""
+        return self._array(as_index(index, len(self.items("accessors")), "accessors"))
+
+    def _read_array(self, number: int) -> Float64[np.ndarray, "count width"]:
+        accessor, where = self.items("accessors")[number], f"accessor {number}"
+        check_accessor(number, accessor)
+        component, kind = accessor.get("componentType"), accessor.get("type")
+        if component not in tuple(COMPONENTS) or kind not in tuple(COMPONENT_WIDTHS):
+            raise ValueError(
+                f"{where} holds {kind!r} of {component!r}; wanted {list(COMPONENT_WIDTHS)}"
+            )
+        count = as_index(accessor.get("count"), LARGEST_COUNT, f"counts of {where}")
+        view = self._view(accessor["bufferView"])
+        dtype, width = np.dtype(COMPONENTS[component]), COMPONENT_WIDTHS[kind]
+        start = as_index(accessor.get("byteOffset", 0), LARGEST_COUNT, f"offsets of {where}")
+        item = width * dtype.itemsize
+        stride = as_index(view[1] or item, LARGEST_COUNT, f"strides of {where}")
+        if not count or stride < item or start + stride * (count - 1) + item > len(view[0]):
+            raise ValueError(
+                f"{where} has {count} values of {item} bytes in {len(view[0])} bytes; wanted at "
+                "least one, and as many as there are bytes"
+            )
+        shape, strides = (count, width), (stride, dtype.itemsize)
+        raw = np.ndarray(shape, dtype, buffer=view[0], offset=start, strides=strides)
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            array = raw.astype(np.float64)
+        if accessor.get("normalized") is True and dtype.kind in "iu":
+            array = np.maximum(array / np.iinfo(dtype).max, -1.0)
+        if not np.isfinite(array).all():
+            value = int(np.argmin(np.isfinite(array).all(axis=-1)))
+            raise ValueError(
+                f"value {value} of {where} is {array[value].tolist()}; wanted finite numbers"
+            )
+        return array
+
+    def _view(self, index: object) -> tuple[memoryview, object]:
+        """The bytes of a buffer view, and its stride."""
+        views = self.items("bufferViews")
+        number = as_index(index, len(views), "bufferViews")
+        view, where = views[number], f"bufferView {number}"
+        check_uncompressed(where, as_item(view.get("extensions", {}), where))
+        content = self._buffer(as_index(view.get("buffer"), len(self.items("buffers")), "buffers"))
+        start = as_index(view.get("byteOffset", 0), LARGEST_COUNT, f"offsets of {where}")
+        length = as_index(view.get("byteLength"), LARGEST_COUNT, f"lengths of {where}")
+        if start + length > len(content):
+            raise ValueError(
+                f"{where} ends at byte {start + length} of a buffer of {len(content)} bytes"
+            )
+        return memoryview(content)[start : start + length], view.get("byteStride")
+
+    def _read_buffer(self, number: int) -> bytes:
+        uri = self.items("buffers")[number].get("uri")
+        if uri is None:
+            if self.binary is None or number:
+                raise ValueError(f"buffer {number} has neither a uri nor a binary part")
+            return self.binary
+        if not isinstance(uri, str):
+            raise ValueError(f"the uri of buffer {number} is {uri!r}; wanted a text")
+        if uri.startswith(DATA):
+            head, _, text = uri.partition(",")
+            try:
+                return base64.b64decode(text if head.endswith(";base64") else "?", validate=True)
+            except binascii.Error:
+                raise ValueError(f"the uri of buffer {number} is no base64") from None
+        content = buffer_path(self.folder, number, uri).read_bytes()
+        self.size += len(content)
+        return content
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The header and the binary part of a GLB; none goes beyond the file."""
+    if content[:4] != MAGIC or content[4:8] != (2).to_bytes(4, "little"):
+        raise ValueError(f"wanted a GLB of version 2, which begins with {MAGIC!r} and 2")
+    parts: dict[int, bytes] = {}
+    start = 12
+    while start + 8 <= len(content):
+        length, kind = (int.from_bytes(content[at : at + 4], "little") for at in (start, start + 4))
+        if start + 8 + length > len(content):
+            raise ValueError(f"a part of {length} bytes begins at byte {start + 8} of "
+                             f"{len(content)}: the file is not whole")  # fmt: skip
+        parts.setdefault(kind, content[start + 8 : start + 8 + length])
+        start += 8 + length
+    if JSON not in parts:
+        raise ValueError("a GLB without a header")
+    return parts[JSON], parts.get(BIN)
+
+
+def as_index(value: object, count: int, what: str) -> int:
+    """The value if it is a whole number from 0 to `count` - 1; else ValueError names it."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < count:
+        raise ValueError(f"{str(value)[:40]} among the {what}; wanted a whole number below {count}")
+    return value
+
+
+def as_item(value: object, what: str) -> Item:
+    """The value if it is a JSON object; else ValueError names it."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{what} is {str(value)[:40]!r}; wanted a JSON object")
+    return value
+
+
+def as_list(value: object, what: str) -> list[Any]:
+    """The value if it is a JSON list; else ValueError names it."""
+    if not isinstance(value, list):
+        raise ValueError(f"{what} is {str(value)[:40]!r}; wanted a list")
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One property of a node over time."""
+
+    path: str
+    """Key of `WIDTHS`."""
+    times: Float64[np.ndarray, " keys"]
+    """Seconds, ascending."""
+    values: Float64[np.ndarray, "keys width"]
+    """Quaternions are xyzw."""
+    interpolation: str
+    """STEP, LINEAR or CUBICSPLINE."""
+    slopes: tuple[Float64[np.ndarray, "keys width"], Float64[np.ndarray, "keys width"]] | None
+    """Of a CUBICSPLINE: before and after each key, a second."""
+
+    def at(self, times: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, "frames width"]:
+        """The values at these times, s; before the first key and after the last they are theirs.
+
+        A CUBICSPLINE is the Hermite spline of the glTF 2.0 specification, appendix C.
+        """
+        before = np.clip(
+            np.searchsorted(self.times, times + ON_KEY, side="right") - 1, 0, len(self.times) - 1
+        )
+        after = np.minimum(before + 1, len(self.times) - 1)
+        gap = self.times[after] - self.times[before]
+        passed = times - self.times[before]
+        fraction = np.divide(passed, gap, out=np.zeros_like(passed), where=gap > 0)
+        fraction = np.clip(fraction, 0.0, 1.0)[:, None]
+        start, end = self.values[before], self.values[after]
+        if self.interpolation == "STEP":
+            return start
+        if self.slopes is not None:
+            t, t2, t3 = fraction, fraction**2, fraction**3
+            arriving, leaving = self.slopes
+            return (
+                (2 * t3 - 3 * t2 + 1) * start
+                + gap[:, None] * (t3 - 2 * t2 + t) * leaving[before]
+                + (3 * t2 - 2 * t3) * end
+                + gap[:, None] * (t3 - t2) * arriving[after]
+            )
+        if self.path == "rotation":
+            first, second = (_rotations(quats) for quats in (start, end))
+            turn = (first.inv() * second).as_rotvec()  # of the shorter arc
+            return (first * Rotation.from_rotvec(fraction * turn)).as_quat()
+        return start + fraction * (end - start)
+
+
+def _rotations(quats: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quats)
+
+
+def read_curve(document: Document, sampler: Item, path: str) -> Curve:
+    """The curve of a sampler.
+
+    Raises:
+        ValueError: its arrays are not those of a curve.
+    """
+    interpolation = sampler.get("interpolation", "LINEAR")
+    if interpolation not in ("STEP", "LINEAR", "CUBICSPLINE"):
+        raise ValueError(f"interpolation {interpolation!r}; wanted STEP, LINEAR or CUBICSPLINE")
+    times = document.array(sampler.get("input"))
+    if times.shape[1] != 1:
+        raise ValueError(f"times have {times.shape[1]} numbers for each key; wanted one")
+    times = times[:, 0]
+    if (np.diff(times) < 0).any() or np.abs(times).max() > LATEST:
+        raise ValueError(f"the times of a {path} are not in order, or beyond {LATEST:g} s")
+    values = document.array(sampler.get("output"))
+    per_key = 3 if interpolation == "CUBICSPLINE" else 1
+    if values.shape != (len(times) * per_key, WIDTHS[path]):
+        raise ValueError(
+            f"a {path} has {values.shape[0]} x {values.shape[1]} numbers for {len(times)} keys; "
+            f"wanted {len(times) * per_key} x {WIDTHS[path]}"
+        )
+    slopes = None
+    if interpolation == "CUBICSPLINE":
+        arriving, values, leaving = np.moveaxis(values.reshape(len(times), 3, -1), 1, 0)
+        slopes = arriving, leaving
+    if path == "rotation" and (np.linalg.norm(values, axis=-1) < 0.1).any():
+        raise ValueError("a rotation is no unit quaternion")
+    return Curve(path, times, values, interpolation, slopes)
+
+
+def frame_times(
+    curves: list[Curve], fps: float | None, most: int
+) -> tuple[Float64[np.ndarray, " frames"], float, tuple[str, ...]]:
+    """The times at which an animation is sampled, s, the time of a frame, s, and remarks.
+
+    Args:
+        curves: of the animation.
+        fps: Hz; None takes the rate at which its keys lie, or else `USUAL_RATE`.
+        most: frames.
+
+    Raises:
+        ValueError: there would be more frames.
+    """
+    keys = np.unique(np.concatenate([curve.times for curve in curves]))
+    keys = keys[np.diff(keys, prepend=-np.inf) > ON_KEY * 10]
+    span = float(keys[-1] - keys[0])
+    remarks = ()
+    frame_time = 1.0 / fps if fps is not None else _time_of_frame(keys)
+    if frame_time is None:
+        frame_time = 1.0 / USUAL_RATE
+        if len(keys) > 1:
+            remarks = (f"its keys follow no frame rate; sampled at {USUAL_RATE:g} Hz",)
+    if span / frame_time >= most:
+        raise ValueError(
+            f"{span:.4g} s at {1 / frame_time:.4g} frames per second; wanted at most {most} frames "
+            "for a file of this size; give a lower fps=... in Python"
+        )
+    count = int(np.floor(span / frame_time + 0.01)) + 1
+    return keys[0] + frame_time * np.arange(count), frame_time, remarks
+
+
+def _time_of_frame(keys: Float64[np.ndarray, " keys"]) -> float | None:
+    """The time, s, of which the gaps between most keys are multiples; None if there is none."""
+    gaps = np.diff(keys)
+    if not len(gaps):
+        return None
+    low, high = 1.0 / RATES[1], 1.0 / RATES[0]
+    for gap in (float(np.median(gaps)), float(gaps.min())):
+        if not low <= gap <= high:
+            continue
+        frames = np.round((keys - keys[0]) / gap)
+        gap = float((keys - keys[0]) @ frames / (frames @ frames))  # the best for all keys
+        off = np.abs((keys - keys[0]) / gap - np.round((keys - keys[0]) / gap))
+        if (off < OFF_GRID).mean() >= ON_GRID:
+            return gap
+    return None
+
+
+Curves = dict[tuple[int, str], Curve]
+"""By node and path."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """All nodes with their parents."""
+
+    nodes: list[Item]
+    parents: list[int]
+    """-1 for those without."""
+
+    @cached_property
+    def order(self) -> list[int]:
+        """All nodes, parents first and children in the file's order.
+
+        Raises:
+            ValueError: nodes are their own ancestors.
+        """
+        children: dict[int, list[int]] = {}
+        for node, parent in enumerate(self.parents):
+            children.setdefault(parent, []).append(node)
+        ordered, waiting = [], children.get(-1, [])[::-1]
+        while waiting:
+            ordered.append(node := waiting.pop())
+            waiting += reversed(children.get(node, []))
+        if len(ordered) < len(self.nodes):
+            raise ValueError("there are nodes that are their own ancestors")
+        return ordered
+
+    def with_ancestors(self, nodes: Iterable[int]) -> set[int]:
+        """The nodes and all that are above them."""
+        above: set[int] = set()
+        for node in nodes:
+            while node >= 0 and node not in above:
+                above.add(node)
+                node = self.parents[node]
+        return above
+
+    def names(self, nodes: list[int]) -> tuple[str, ...]:
+        """Names of nodes, made unique."""
+        names: dict[str, None] = {}
+        for node in nodes:
+            name = self.nodes[node].get("name")
+            name = name if isinstance(name, str) and name.strip() else f"node_{node}"
+            names[name if name not in names else f"{name}_{node}"] = None
+        if len(names) < len(nodes):
+            return tuple(f"node_{node}" for node in nodes)
+        return tuple(names)
+
+
+def read_tree(document: Document) -> Tree:
+    """The nodes of a file.
+
+    Raises:
+        ValueError: a node has two parents.
+    """
+    nodes = document.items("nodes")
+    parents = [-1] * len(nodes)
+    for node, item in enumerate(nodes):
+        for child in as_list(item.get("children", []), f"children of node {node}"):
+            child = as_index(child, len(nodes), f"children of node {node}")
+            if parents[child] >= 0:
+                raise ValueError(f"node {child} has two parents, {parents[child]} and {node}")
+            parents[child] = node
+    return Tree(nodes, parents)
+
+
+def find_joints(
+    document: Document, tree: Tree, animated: set[int]
+) -> tuple[list[int], tuple[str, ...]]:
+    """The joints of the skeleton that an animation moves, parents first, and remarks.
+
+    They are the joints of the skins that it moves, the nodes that it moves beside them, or all that
+    it moves in a file without skins; what hangs from these, and the nodes between them. Of several
+    separate skeletons the one with the most joints is taken.
+    """
+    ancestors = tree.with_ancestors(animated)
+    skins = [
+        {as_index(joint, len(tree.nodes), "joints of a skin") for joint in joints}
+        for skin in document.items("skins")
+        if (joints := as_list(skin.get("joints"), "the joints of a skin"))
+    ]
+    moved = [joints for joints in skins if joints & ancestors] or skins
+    skinned = set().union(*moved)
+    beside = animated - tree.with_ancestors(skinned)
+    members = skinned | _hanging(tree, skinned | beside, animated)
+    if not members:
+        raise ValueError("no joints: neither a skin nor a node that the animation moves")
+    below = [int(node in members) for node in range(len(tree.nodes))]  # members from a node on
+    for node in reversed(tree.order):
+        if tree.parents[node] >= 0:
+            below[tree.parents[node]] += below[node]
+    top = max((node for node in tree.order if tree.parents[node] < 0), key=below.__getitem__)
+    inside = {top}
+    for node in tree.order:
+        if tree.parents[node] in inside and below[node]:
+            inside.add(node)
+            if top not in members and below[node] == below[top]:  # all of them are below this one
+                inside, top = {node}, node
+    remarks = []
+    if skinned and (unskinned := beside & members & inside):
+        remarks.append(f"{len(unskinned)} joints that no skin has are taken too, as they move")
+    if others := len(members) - below[top]:
+        remarks.append(f"{others} joints of other skeletons in the file are left out")
+    return [node for node in tree.order if node in inside], tuple(remarks)
+
+
+def _hanging(tree: Tree, tops: set[int], animated: set[int]) -> set[int]:
+    """Nodes and all below them, without cameras, and without meshes that do not move themselves."""
+    below: set[int] = set()
+    for node in tree.order:
+        if node in tops or tree.parents[node] in below:
+            below.add(node)
+
+    def is_joint(node: int) -> bool:
+        item = tree.nodes[node]
+        return not {"camera", "skin"} & set(item) and ("mesh" not in item or node in animated)
+
+    return {node for node in below if is_joint(node)}
+
+
+def world_transforms(
+    tree: Tree, joints: list[int], curves: Curves, times: Float64[np.ndarray, " frames"]
+) -> tuple[Float64[np.ndarray, "frames joints 3"], Float64[np.ndarray, "frames joints 4"]]:
+    """World positions, and rotations wxyz, of joints below all their ancestors.
+
+    Positions are exact with any scales on the way. A joint's axes are those that its x and y axes
+    have in the world, made perpendicular; where a scale of 0 leaves none, scales do not count.
+
+    Raises:
+        ValueError: a transform is none, or goes beyond what numbers can hold.
+    """
+    needed = tree.with_ancestors(joints)
+    places: dict[int, tuple[np.ndarray, np.ndarray, Rotation]] = {
+        -1: (np.zeros((1, 3)), np.eye(3)[None], Rotation.identity(1))
+    }
+    with np.errstate(all="ignore"):
+        for node in (node for node in tree.order if node in needed):
+            offset, linear, turn = _local(tree, node, curves, times)
+            above, above_linear, above_turn = places[tree.parents[node]]
+            position = above + (above_linear @ offset[..., None])[..., 0]
+            places[node] = position, above_linear @ linear, above_turn * turn
+            if not all(np.isfinite(part).all() for part in places[node][:2]):
+                name = tree.names([node])[0]
+                raise ValueError(f"node {name} is moved or scaled beyond all bounds")
+    frames = len(times)
+    positions = [np.broadcast_to(places[joint][0], (frames, 3)) for joint in joints]
+    rotations = [np.broadcast_to(_axes(*places[joint][1:]), (frames, 4)) for joint in joints]
+    return np.stack(positions, axis=1), np.stack(rotations, axis=1)
+
+
+def _axes(linear: np.ndarray, turn: Rotation) -> Float64[np.ndarray, "frames 4"]:
+    """The rotation of a linear map, wxyz; `turn` where it has no two axes."""
+    x, y = _unit(linear[..., 0]), _unit(linear[..., 1])
+    y = y - np.sum(x * y, axis=-1, keepdims=True) * x
+    height = np.linalg.norm(y, axis=-1)
+    is_known = x.any(axis=-1) & (height > FLAT)
+    matrices = np.broadcast_to(turn.as_matrix(), linear.shape).copy()
+    x, y = x[is_known], y[is_known] / height[is_known, None]
+    matrices[is_known] = np.stack([x, y, np.cross(x, y)], axis=-1)
+    return Rotation.from_matrix(matrices).as_quat(scalar_first=True)
+
+
+def _unit(axes: Float64[np.ndarray, "frames 3"]) -> Float64[np.ndarray, "frames 3"]:
+    """Axes of length one, however long or short they were; zero stays zero."""
+    largest = np.abs(axes).max(axis=-1, keepdims=True)
+    axes = np.divide(axes, largest, out=np.zeros_like(axes), where=largest > 0)
+    return axes / np.maximum(np.linalg.norm(axes, axis=-1, keepdims=True), 1.0)
+
+
+def _local(
+    tree: Tree, node: int, curves: Curves, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Rotation]:
+    """A node's position, its rotation with scale as a matrix, and its rotation.
+
+    They have one frame where nothing about the node is animated.
+    """
+    item = tree.nodes[node]
+    if "matrix" in item:
+        if any((node, path) in curves for path in WIDTHS):
+            raise ValueError(f"node {node} has a matrix and is animated, which excludes each other")
+        matrix = _numbers(item["matrix"], 16, f"the matrix of node {node}").reshape(4, 4).T
+        return matrix[None, :3, 3], matrix[None, :3, :3], Rotation.identity(1)
+    values = {}
+    for path, width in WIDTHS.items():
+        curve = curves.get((node, path))
+        if curve is None:
+            given = item.get(path, DEFAULTS[path])
+            values[path] = _numbers(given, width, f"the {path} of node {node}")[None]
+        else:
+            values[path] = curve.at(times)
+    quats = values["rotation"]
+    if (np.abs(quats).max(axis=-1) < 1e-3).any():
+        raise ValueError(f"the rotation of node {node} is no unit quaternion")
+    turn = Rotation.from_quat(quats)
+    return values["translation"], turn.as_matrix() * values["scale"][:, None, :], turn
+
+
+def _numbers(value: object, count: int, what: str) -> Float64[np.ndarray, " count"]:
+    values = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    is_good = len(values) == count and all(type(number) in (int, float) for number in values)
+    if not is_good or not all(abs(number) < 1e30 for number in values):
+        raise ValueError(f"{what} is {str(value)[:60]}; wanted {count} finite numbers")
+    return np.array(values, np.float64)
+
+
+def read_gltf(path: Path, animation: str | None = None, fps: float | None = None) -> Recording:
+    """The skeleton and one animation of a glTF file, in metres with y up.
+
+    It is sampled at the rate at which its keys lie, or else at 30 Hz with a remark.
+
+    Args:
+        path: .glb, or .gltf with its buffers inside or beside it.
+        animation: its name; None takes the only one.
+        fps: frames per second at which it is sampled; None takes the file's.
+
+    Raises:
+        ValueError: with the file's name, where it is not glTF, has no such animation or several of
+            which none was chosen, or uses sparse or compressed arrays for it.
+    """
+    with error_context(path):
+        if fps is not None and not SLOWEST <= fps <= FASTEST:
+            raise ValueError(f"fps is {fps}; wanted {SLOWEST:g} to {FASTEST:g}")
+        document = Document(path)
+        tree = read_tree(document)
+        name, chosen = _choose(_animations(document), animation)
+        curves = _curves(document, chosen, tree)
+        joints, left_out = find_joints(document, tree, {node for node, _ in curves})
+        nodes = len(tree.with_ancestors(joints))
+        most = max(MOST_NUMBERS, document.size) // nodes
+        times, frame_time, remarks = frame_times(list(curves.values()), fps, most)
+        number_of = {joint: number for number, joint in enumerate(joints)}
+        parents = tuple(number_of.get(tree.parents[joint], -1) for joint in joints)
+        motion = world_transforms(tree, joints, curves, times)
+        rest = world_transforms(tree, joints, {}, times[:1])
+    positions_ls, rotations_ls = local_from_world(parents, *motion)
+    offsets_ls, rest_rotations_ls = local_from_world(parents, *rest)
+    return Recording(
+        tree.names(joints), parents, offsets_ls[0], positions_ls, rotations_ls, frame_time,
+        metres_per_unit=1.0, up_axis="y", rest_rotations_ls=rest_rotations_ls[0],
+        remarks=(*remarks, *left_out),
+    )  # fmt: skip
+
+
+def _animations(document: Document) -> dict[str, Item]:
+    """By name, the animations that move nodes."""
+    animations: dict[str, Item] = {}
+    for number, animation in enumerate(document.items("animations")):
+        channels = as_list(animation.get("channels", []), f"channels of animation {number}")
+        targets = [_target(as_item(channel, "a channel")) for channel in channels]
+        if any(target.get("path") in PATHS for target in targets):
+            name = animation.get("name")
+            name = name if isinstance(name, str) and name else f"animation {number}"
+            animations[name if name not in animations else f"{name} {number}"] = animation
+    return animations
+
+
+def _choose(animations: dict[str, Item], name: str | None) -> tuple[str, Item]:
+    """The animation of this name, or the only one.
+
+    Raises:
+        ValueError: there is none, or there are several; the message lists them.
+    """
+    known = ", ".join(map(repr, animations))
+    if not animations:
+        raise ValueError("no animation that moves nodes; wanted a skeleton with its motion")
+    if name is None and len(animations) > 1:
+        raise ValueError(
+            f"{len(animations)} animations: {known}; choose one with animation=... (--animation)"
+        )
+    name = next(iter(animations)) if name is None else name
+    if name not in animations:
+        raise ValueError(f"no animation {name!r}; there are {known}")
+    return name, animations[name]
+
+
+def _target(channel: Item) -> Item:
+    return as_item(channel.get("target", {}), "the target of a channel")
+
+
+def _curves(document: Document, animation: Item, tree: Tree) -> Curves:
+    """The curves of an animation; those of morph targets and of extensions are left out."""
+    samplers = as_list(animation.get("samplers", []), "the samplers of an animation")
+    curves: Curves = {}
+    keys = 0
+    for channel in animation["channels"]:
+        target = _target(channel)
+        path, node = target.get("path"), target.get("node")
+        if path in PATHS and node is not None:
+            node = as_index(node, len(tree.nodes), "nodes of a channel")
+            number = as_index(channel.get("sampler"), len(samplers), "samplers of a channel")
+            sampler = as_item(samplers[number], f"sampler {number}")
+            with error_context(f"{path} of {tree.names([node])[0]}, node {node}"):
+                curves[node, path] = read_curve(document, sampler, path)
+            keys += len(curves[node, path].times)
+        if keys > max(MOST_NUMBERS, document.size):
+            raise ValueError(f"more keys than a file of {document.size} bytes can have")
+    if not curves:
+        raise ValueError("its animation moves no node")
+    return curves
+
+
+class RefusalError(ValueError):
+    """Of a file that is glTF, but not in a way that is read."""
+
+
+def checked(kind: str, content: bytes, folder: Path) -> bytes:
+    """The content without its characters, whose meshes hang on skeletons.
+
+    Args:
+        kind: of the file: others than `KINDS` are left as they are.
+        content: of the file.
+        folder: in which it is.
+
+    Raises:
+        RefusalError: a mesh or an array is compressed, sparse or without bytes, or a file with
+            bytes is missing.
+        ValueError: a header that is not JSON.
+    """
+    if kind not in KINDS:
+        return content
+    text, rest = content, b""
+    if kind == BINARY:
+        end = JSON_START + int.from_bytes(content[12:16], "little")
+        text, rest = content[JSON_START:end], content[end:]
+    header = json.loads(text.decode("utf-8"))
+    if not isinstance(header, dict):
+        return content
+    for number, buffer in enumerate(header.get("buffers", [])):
+        if not (uri := buffer.get("uri", DATA)).startswith(DATA):
+            buffer_path(folder, number, uri)
+    for number, mesh in enumerate(header.get("meshes", [])):
+        for primitive in mesh["primitives"]:
+            check_uncompressed(f"mesh {number}", primitive.get("extensions", {}))
+    for number, view in enumerate(header.get("bufferViews", [])):
+        check_uncompressed(f"bufferView {number}", view.get("extensions", {}))
+    for number, accessor in enumerate(header.get("accessors", [])):
+        check_accessor(number, accessor)
+    characters = [node for node in header.get("nodes", []) if "skin" in node and "mesh" in node]
+    if not characters:
+        return content
+    for node in characters:
+        del node["mesh"]
+    text = json.dumps(header).encode()
+    if kind != BINARY:
+        return text
+    text += b" " * (-len(text) % 4)
+    size = JSON_START + len(text) + len(rest)
+    head = content[:8] + size.to_bytes(4, "little") + len(text).to_bytes(4, "little")
+    return head + content[16:JSON_START] + text + rest
+
+
+def check_accessor(number: int, accessor: Mapping[str, Any]) -> None:
+    """RefusalError for an accessor whose values are not all in a buffer view."""
+    if "sparse" in accessor:
+        raise RefusalError(
+            f"accessor {number} is sparse, which is not supported; export it in full"
+        )
+    if "bufferView" not in accessor:  # which would stand for any number of zeros
+        raise RefusalError(f"accessor {number} has {accessor.get('count')} values but no bytes")
+
+
+def check_uncompressed(what: str, extensions: Mapping[str, Any]) -> None:
+    """RefusalError for a part of a file that has one of the extensions that compress it."""
+    if compressing := [name for name in extensions if "compression" in name]:
+        raise RefusalError(
+            f"{what} is compressed ({compressing[0]}); export it without compression"
+        )
+
+
+def buffer_path(folder: Path, number: int, uri: str) -> Path:
+    """The file in which a buffer is.
+
+    Args:
+        folder: of the glTF file.
+        number: of the buffer.
+        uri: as the file has it.
+
+    Raises:
+        RefusalError: it is elsewhere than beside the glTF file, or cannot be read.
+    """
+    name = unquote(uri)
+    if not name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise RefusalError(f"buffer {number} is in {uri!r}; wanted a file beside this one")
+    path = folder / name
+    if reason := why_unreadable(path):
+        raise RefusalError(
+            f"buffer {number} is in {uri!r}: {reason}; put that file beside this one, or export "
+            "a .glb, which has all in one file"
+        )
+    return path

@@ -1,0 +1,184 @@
+"""`load_clip`: opens a motion file with the reader that its suffix selects."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from fitting.runtime.validation import check_file
+
+from . import edit, formats
+from .assemble import Overrides, clip_from_recording
+from .clip import Clip, Recording
+from .formats.asfamc import read_asfamc
+from .formats.c3d import draft_marker_map, joint_name, read_c3d
+from .formats.gltf import SUFFIXES as GLTF
+from .formats.gltf import read_gltf
+from .formats.npz import read_npz
+from .joint_maps import read_joint_map, template
+
+JointMap = Mapping[str, str] | str | Path
+"""Role to joint name, see `joint_maps.find_roles`; or a file that `clips.joint_maps` reads."""
+
+
+@dataclass(frozen=True)
+class ClipOptions:
+    """What the user knows better than a motion file; None leaves it to be read or guessed.
+
+    The fields are arguments of `load_clip`: `load_clip(path, **vars(options))`.
+    """
+
+    joints: JointMap | None = None
+    """Which joint is which."""
+    scale: float | None = None
+    """Metres per unit of the file."""
+    up: str | None = None
+    """Either "y" or "z"."""
+    asf: Path | None = None
+    """Skeleton of an AMC file."""
+    animation: str | None = None
+    """Which animation of a glTF file."""
+    travel: str | None = None
+    """Whether the root travels as standing feet show: one of `clips.skating.TRAVELS`."""
+    sole: float | None = None
+    """m, of the balls of flat feet over their soles."""
+
+    def of_file(self, path: Path) -> "ClipOptions":
+        """Those that a file of this format takes, where several files share the options."""
+        suffix = path.suffix.lower()
+        if suffix == ".npz":
+            return ClipOptions(sole=self.sole)
+        asf = self.asf if suffix == ".amc" else None
+        return replace(self, asf=asf, animation=self.animation if suffix in GLTF else None)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The options that are not None, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def check_use(self, files: Iterable[Path], where: str) -> None:
+        """Raises ValueError for an option that none of these files takes.
+
+        Args:
+            files: clips that share the options.
+            where: what they belong to, for the message.
+        """
+        taken = {name for file in files for name in self.of_file(file).given}
+        if unused := sorted(set(self.given) - taken):
+            raise ValueError(
+                f"{where}: {unused[0]} is of no use: an .npz states all but --sole itself, only an "
+                ".amc has an .asf, and only a .glb or .gltf an animation to choose"
+            )
+
+
+AS_FOUND = ClipOptions()
+"""All is recognised or guessed."""
+
+
+def load_clip(
+    path: str | Path,
+    *,
+    asf: str | Path | None = None,
+    scale: float | None = None,
+    fps: float | None = None,
+    up: str | None = None,
+    joints: JointMap | None = None,
+    variant: str = "captured",
+    animation: str | None = None,
+    travel: str | None = None,
+    sole: float | None = None,
+) -> Clip:
+    """Reads a BVH, AMC (with its ASF), glTF, GLB, C3D or NPZ file as a clip in metres with y up.
+
+    Args:
+        path: the file; its suffix selects the format.
+        asf: skeleton of an AMC file; None looks for it in the same folder.
+        scale: metres per unit of the file. None takes it from the file if it states one (ASF), and
+            otherwise the unit that makes the legs most similar to an adult's.
+        fps: frames per second; None takes the file's, rounded to the nearest common rate. A glTF
+            animation is sampled at this rate, and any other plays as fast as it says.
+        up: "y" or "z"; None takes the axis along which the pelvis is above the feet.
+        joints: role to joint name, see `joint_maps.find_roles`, or a joint map, see
+            `clips.joint_maps`; None recognises the names. Of a C3D file it names markers, see
+            `clips.formats.c3d.read_c3d`.
+        variant: which clip of a file of the `blocks` benchmark: "captured" or "base", the flat
+            animation.
+        animation: which animation of a glTF file; None takes the only one.
+        travel: "stances" moves the root so that standing feet stay where they stand, "none" leaves
+            it, and "auto", or None, moves it in a cycle that is clearly in place.
+        sole: m, of the balls of flat feet over their soles; None measures it over a floor at height
+            0, or estimates it from the feet's length.
+
+    Returns:
+        The clip; its `remarks` list every guess. A file without recognised legs loads, and its
+        `rig` raises.
+
+    Raises:
+        ValueError: no such file, an unknown format, a file that is not what its suffix promises
+            (with the line, for text formats), an argument out of range or of another format, or
+            names in `joints` that the file lacks.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    _check_arguments(path, asf, animation)
+    if isinstance(joints, str | Path):
+        joints = read_joint_map(Path(joints))
+    overrides = Overrides(scale, fps, up, joints, travel)
+    if suffix == ".npz":
+        arguments = {**vars(overrides), "animation": animation}
+        if unused := [name for name, value in arguments.items() if value is not None]:
+            raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
+        return edit.on_floor(read_npz(path, variant), 0.0, sole)
+    if variant != "captured":
+        raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
+    if suffix == ".c3d":
+        recording = read_c3d(path, joints, scale)
+        if joints is not None:  # which named markers
+            overrides = replace(overrides, joints={role: joint_name(role) for role in joints})
+    else:
+        recording = _read(path, asf, animation, fps)
+    return edit.on_floor(clip_from_recording(recording, path.name, overrides), 0.0, sole)
+
+
+def _check_arguments(path: Path, asf: str | Path | None, animation: str | None) -> None:
+    """ValueError for no such file, an unknown format, or an argument of another format."""
+    suffix = path.suffix.lower()
+    if suffix not in (*formats.READERS, ".npz"):
+        raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
+    check_file(path)
+    if asf is not None and suffix != ".amc":
+        raise ValueError(f"{path}: only an .amc has its skeleton in an .asf; got {asf}")
+    if animation is not None and suffix not in (*GLTF, ".npz"):
+        raise ValueError(f"{path}: only glTF files have an animation to choose, {animation!r}")
+
+
+def _read(
+    path: Path, asf: str | Path | None, animation: str | None, fps: float | None = None
+) -> Recording:
+    """The contents of a file that holds joints."""
+    if path.suffix.lower() in GLTF:
+        return read_gltf(path, animation, fps)
+    if asf is not None:
+        return read_asfamc(path, Path(asf))
+    return formats.READERS[path.suffix.lower()](path)
+
+
+def draft_joint_map(path: Path, options: ClipOptions) -> str:
+    """A joint map of a clip to be edited, with the best guess and all that it can name.
+
+    Args:
+        path: the file.
+        options: how it is read; a map among them is of no use.
+
+    Raises:
+        ValueError: as of `load_clip`, or the file is an NPZ, which takes no map.
+    """
+    if path.suffix.lower() == ".npz":
+        raise ValueError(f"{path}: an .npz states which joint is which, and takes no joint map")
+    if path.suffix.lower() == ".c3d":
+        check_file(path)
+        return draft_marker_map(path)
+    _check_arguments(path, options.asf, options.animation)
+    recording = _read(path, options.asf, options.animation)
+    return template(recording.names, recording.parents, path.name)

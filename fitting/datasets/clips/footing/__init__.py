@@ -1,1 +1,0 @@
-"""How feet move while they stand: noise that shakes them, and a slide of the whole character."""

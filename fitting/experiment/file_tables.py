@@ -1,0 +1,374 @@
+"""Ablations: an experiment with something left out, as each of its [[without]] tables says.
+
+[[without]]
+name = "support"
+rules = { pelvis = "LowestPelvis" }     # other rules, by stage
+parameters = { lock.enabled = false }   # fixed at these values, even if they are free otherwise
+free = { pelvis.limit = {} }            # fitted in addition
+"""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar, get_args
+
+import numpy as np
+
+import jaxik
+from fitting.inference.mixed_model import Grouping
+from fitting.inference.sensitivity import FreeTable
+from fitting.problem.capture_system import PREFIX, is_of_capture, without_ends
+from fitting.problem.scene import GROUND, SHIFT, SPREAD, Capture, Scene
+from fitting.problem.space import SPREADS, ParameterPrior, Priors, Shape, Space
+from fitting.runtime import validation
+from fitting.runtime.validation import (
+    Content,
+    Table,
+    check_keys,
+    check_table,
+    flatten,
+    nest,
+    with_floats,
+)
+from jaxik.maths import parameter_tree
+from jaxik.stages.probe.capsule import SweepProbe
+
+from .systems import FREE_KEYS, leaf_names, read_free_table, rule_names, with_parameters, with_rules
+
+COMPLETE = "all rules"  # the name of the experiment with nothing left out
+
+Entry = TypeVar("Entry")
+CAPTURE_NAMES = tuple(parameter_tree.declarations(Capture()))
+
+LEVELS = ("per_subject", "per_clip")
+HIERARCHY_NAMES = validation.list_of_texts("a list of names of free parameters")
+HIERARCHY_KEYS = {
+    "per_subject": HIERARCHY_NAMES.meaning(
+        "Free parameters of which each subject has its own value."
+    ),
+    "per_clip": HIERARCHY_NAMES.meaning("Free parameters of which each clip has its own value."),
+    "scale_with_body": validation.BOOLEAN.meaning(
+        "Whether lengths, speeds and times follow the legs of each clip's body."
+    ),
+}
+
+DEFAULT_KEYS: dict[str, validation.Constraint] = {
+    "shape": validation.one_of(get_args(Shape)).meaning(
+        "Distribution of u, the free parameter on its scale; a uniform one has no centre and no"
+        " spread."
+    ),
+    "spread": validation.number(*SPREADS).meaning("Standard deviation of u."),
+}
+CENTRE = validation.NUMBER.meaning("Median, in the parameter's unit; left out, the system's value.")
+PRIOR_KEYS = {**DEFAULT_KEYS, "centre": CENTRE}
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What differs from the experiment, under a name."""
+
+    name: str
+    rules: Mapping[str, str] = field(default_factory=dict)
+    """By stage."""
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    """By dotted name."""
+    free: FreeTable = field(default_factory=dict)
+    """By dotted name."""
+
+
+ABLATION_KEYS = {
+    "name": validation.TEXT.meaning("What is left out. Needed."),
+    "rules": validation.TABLE.meaning("Other rules, by stage."),
+    "parameters": validation.TABLE.meaning("Fixed at these values, even if they are free else."),
+    "free": validation.TABLE.meaning("Fitted in addition."),
+}
+
+
+def read_ablations(tables: Sequence[object], ik: jaxik.FootIK, where: str) -> tuple[Ablation, ...]:
+    """The ablations in TOML tables.
+
+    Args:
+        tables: the tables.
+        ik: the system from which they differ.
+        where: the tables' place in their file, for error messages.
+
+    Raises:
+        ValueError: a key, stage, rule or parameter is unknown; a value is wrong; a name is missing,
+            empty or taken; an ablation changes nothing.
+    """
+    ablations: list[Ablation] = []
+    for table in tables:
+        ablation = _read(validation.check_table(table, ABLATION_KEYS, where), ik, where)
+        if ablation.name in (COMPLETE, *(earlier.name for earlier in ablations)):
+            raise ValueError(f"{where}: there already is a variant named {ablation.name!r}")
+        ablations.append(ablation)
+    return tuple(ablations)
+
+
+def _read(table: validation.Table, ik: jaxik.FootIK, where: str) -> Ablation:
+    name = table.get("name", "")
+    if not name.strip():
+        raise ValueError(f"{where}: a variant without a name; wanted name = 'what is left out'")
+    parameters = validation.flatten(table.get("parameters", {}), 2)
+    free = read_free_table(table.get("free", {}), f"{where} {name}: free")
+    rules = dict(table.get("rules", {}))
+    changed = with_rules(ik, rules, f"{where} {name}: rules")
+    with_parameters(changed, parameters, f"{where} {name}: parameters")
+    leaves = {full.partition("[")[0]: None for full in free}  # one leg's element has an index
+    validation.check_keys(leaves, leaf_names(changed), f"{where} {name}: free")
+    if not parameters and not free and rule_names(changed) == rule_names(ik):
+        raise ValueError(f"{where} {name}: changes nothing; wanted other rules or parameters")
+    return Ablation(name, rules, parameters, free)
+
+
+def read_capture(table: Table, clips: int, where: str) -> FreeTable:
+    """The entries of a [capture] table by name.
+
+    Args:
+        table: as TOML reads it.
+        clips: how many the experiment has.
+        where: the table's place in its file, for error messages.
+
+    Raises:
+        ValueError: a name or a clip is unknown, or a value is wrong.
+    """
+    check_keys(
+        {name.partition("[")[0]: entry for name, entry in table.items()}, CAPTURE_NAMES, where
+    )
+    numbers = [f"[{clip}]" for clip in range(clips)]
+    for name in table:
+        if "[" in name and name[name.index("[") :] not in numbers:
+            raise ValueError(f"{where}: no clip for {name!r}; wanted a number of {numbers}")
+    return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in table.items()}
+
+
+def free_table(capture: FreeTable, clips: int) -> FreeTable:
+    """The entries by dotted name: one for each clip, with its number where there are several."""
+    table = {}
+    for name, overrides in capture.items():
+        of_all = clips > 1 and "[" not in name
+        names = [f"{name}[{clip}]" for clip in range(clips)] if of_all else [name]
+        table |= {f"{PREFIX}{each}": overrides for each in names}
+    return table
+
+
+def known_names(capture: FreeTable, clips: int) -> list[str]:
+    """Dotted names that may stand in [prior] and [start]; without a number for all clips."""
+    return [*(f"{PREFIX}{name}" for name in capture), *free_table(capture, clips)]
+
+
+def entry_for(name: str, table: Mapping[str, Entry]) -> Entry | None:
+    """What a table has for a free parameter; that of a clip's capture may stand there for all."""
+    of_all = name.partition("[")[0] if is_of_capture(name) else name
+    return table.get(name, table.get(of_all))
+
+
+def with_narrow_priors(priors: Priors, names: Iterable[str]) -> Priors:
+    """The priors with those of a capture, which are narrow where nothing else is said.
+
+    Args:
+        priors: as the experiment states them.
+        names: dotted, of the free parameters of captures.
+    """
+    named = dict(priors.named)
+    for name in names:
+        prior = entry_for(name, priors.named) or ParameterPrior()
+        if prior.shape == "normal" and prior.spread is None:
+            prior = dataclasses.replace(prior, spread=SPREAD)
+        named[name] = prior
+    return dataclasses.replace(priors, named=named)
+
+
+def prepare(scenes: Sequence[Scene], space: Space[jaxik.FootIK], where: str) -> list[Scene]:
+    """The scenes of clips whose captures are fitted.
+
+    Each keeps a ground of its own. Where the capture is shifted in time, frames at the ends of its
+    clip do not count, of which it may show nothing.
+
+    Args:
+        scenes: of all clips.
+        space: of the free parameters.
+        where: the table's place in its file, for error messages.
+
+    Raises:
+        ValueError: the system sweeps shapes over ground that is to move, or nothing is left of a
+            clip.
+    """
+    ground = [name for name in GROUND for p in space.parameters if p.leaf == f"{PREFIX}{name}"]
+    if ground and isinstance(space.system.probe, SweepProbe):
+        raise ValueError(
+            f"{where}: {ground} cannot be fitted with the probe SweepProbe, whose shapes need the "
+            "ground as it is; leave them out, or take another probe in [rules]"
+        )
+    prepared = list(scenes)
+    for parameter in space.parameters:
+        if parameter.leaf == f"{PREFIX}{SHIFT}":
+            reach = max(-parameter.low, parameter.high)
+            for clip in range(len(scenes)) if parameter.leg is None else [parameter.leg]:
+                prepared[clip] = without_ends(scenes[clip], reach)
+                if not np.any(prepared[clip].reference.observed):
+                    raise ValueError(
+                        f"{where}: nothing is left of clip {clip + 1} without the {reach:g} s at "
+                        f"its ends that {SHIFT} may shift away; take a longer part of it, or a "
+                        "narrower range"
+                    )
+    return prepared
+
+
+def check_unnumbered(capture: FreeTable, where: str) -> None:
+    """Checks that a table goes for each clip alone.
+
+    Raises:
+        ValueError: something in it is of one of several clips only.
+    """
+    if numbered := [name for name in capture if "[" in name]:
+        raise ValueError(
+            f"{where} [capture]: {numbered} are of one of several clips, but each is fitted alone; "
+            "leave the numbers out, or fit the clips --together"
+        )
+
+
+def refuse(capture: FreeTable, where: str, command: str) -> None:
+    """Refuses an experiment with a capture for a command that fits systems only.
+
+    Raises:
+        ValueError: there is something in the table.
+    """
+    if capture:
+        raise ValueError(
+            f"{where} [capture]: {sorted(capture)} cannot be fitted by `jaxik {command}`, which "
+            "takes clips as they are; leave the table out, or see by `jaxik fit` what it finds"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Hierarchy:
+    """What several clips and subjects have in common."""
+
+    per_subject: tuple[str, ...] = ()
+    """Names of free parameters that each subject has its own value of."""
+    per_clip: tuple[str, ...] = ()
+    """Likewise, each clip."""
+    scale_with_body: bool = False
+    """Whether lengths, speeds and times follow the legs of each clip's body."""
+
+    @property
+    def varying(self) -> tuple[str, ...]:
+        """Names of the parameters that are not shared by all clips."""
+        return (*self.per_subject, *self.per_clip)
+
+    def level(self, name: str) -> str:
+        """What has its own value of a parameter: `clip` or `subject`; else it is `shared`."""
+        return (
+            "clip" if name in self.per_clip else "subject" if name in self.per_subject else "shared"
+        )
+
+    def grouping(
+        self, names: Sequence[str], clips: Sequence[str], subjects: Sequence[str]
+    ) -> Grouping:
+        """Which clips have the values of these parameters in common.
+
+        Args:
+            names: of the free parameters.
+            clips: a name for each clip, all different.
+            subjects: whom each clip shows.
+        """
+        if not self.varying:
+            return Grouping.pooled(len(clips), len(names))
+        labels = {"clip": clips, "subject": subjects, "shared": None}
+        return Grouping.of_labels([labels[self.level(name)] for name in names])
+
+
+def read_hierarchy(
+    value: object, free: Collection[str], subjects: Sequence[str | None], where: str
+) -> Hierarchy:
+    """The [hierarchy] of an experiment.
+
+    Args:
+        value: as TOML reads it.
+        free: names of the free parameters.
+        subjects: whom each clip shows; None where it does not say.
+        where: the table's place in its file, for error messages.
+
+    Raises:
+        ValueError: a key is unknown, or a value is wrong; a name is not free or stands twice; a
+            parameter is to vary between subjects, and a clip does not say whom it shows, or all
+            show the same; a parameter is to vary between clips, and there is only one.
+    """
+    table = check_table(value, HIERARCHY_KEYS, where)
+    lists = {level: tuple(table.get(level, ())) for level in LEVELS}
+    names = [name for level in LEVELS for name in lists[level]]
+    for name in names:
+        if name not in free:
+            raise ValueError(f"{where}: {name!r} is not free; free are {sorted(free)}")
+        if names.count(name) > 1:
+            raise ValueError(f"{where}: {name!r} stands twice; wanted it per clip or per subject")
+    if lists["per_clip"] and len(subjects) < 2:
+        raise ValueError(f"{where}: per_clip needs two clips or more; there is one")
+    if lists["per_subject"]:
+        if None in subjects:
+            number = subjects.index(None) + 1
+            raise ValueError(
+                f"{where}: per_subject needs a subject in each of [[clips]]; clip {number} has none"
+            )
+        if len(set(subjects)) < 2:
+            raise ValueError(
+                f"{where}: per_subject needs two subjects or more; all clips are of {subjects[0]!r}"
+            )
+    return Hierarchy(**lists, scale_with_body=table.get("scale_with_body", False))
+
+
+def hierarchy_to_table(hierarchy: Hierarchy) -> Content:
+    """The [hierarchy] table; empty for the default."""
+    return {name: value for name, value in dataclasses.asdict(hierarchy).items() if value}
+
+
+def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
+    """The priors in a [prior] table.
+
+    A parameter without a shape or a spread of its own has the table's.
+
+    Args:
+        table: as TOML reads it.
+        free: names of all parameters that may have a prior.
+        where: the table's place in its file, for error messages.
+
+    Raises:
+        ValueError: a key is no key of the table and no free parameter, or a value is wrong.
+    """
+    entries = flatten(table, 2)
+    check_keys(entries, [*DEFAULT_KEYS, *free], where)
+    default = {key: entries.pop(key) for key in DEFAULT_KEYS if key in entries}
+    check_table(default, DEFAULT_KEYS, where)
+    named = {}
+    for name, entry in entries.items():
+        given = check_table(entry, PRIOR_KEYS, f"{where} {name}")
+        normal = given.get("shape", default.get("shape")) != "uniform"
+        inherited = default if normal else {"shape": "uniform"}
+        with validation.error_context(f"{where} {name}"):
+            named[name] = ParameterPrior(**with_floats({**inherited, **given}, PRIOR_KEYS))
+    with validation.error_context(where):
+        return Priors(ParameterPrior(**with_floats(default, PRIOR_KEYS)), named)
+
+
+def priors_to_table(priors: Priors) -> Content:
+    """The [prior] table; empty for the default."""
+    if priors == Priors():
+        return {}
+    tables = {name: _changed(prior) for name, prior in priors.named.items()}
+    return {**_changed(priors.default), **nest(tables)}
+
+
+def _changed(prior: ParameterPrior) -> Content:
+    return {key: value for key, value in dataclasses.asdict(prior).items() if value is not None}
+
+
+def read_start(table: Table, free: Collection[str], where: str) -> Mapping[str, float]:
+    """The values in a [start] table by dotted name; arguments as `read_priors`.
+
+    Raises:
+        ValueError: a name is not free, or a value is no number.
+    """
+    values = flatten(table, 2)
+    check_table(values, dict.fromkeys(free, validation.NUMBER), where)
+    return with_floats(values, values)

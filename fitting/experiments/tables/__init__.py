@@ -1,1 +1,0 @@
-"""Readers of single tables of an experiment file: [[clips]], [prior] and [start]."""

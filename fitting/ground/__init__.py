@@ -1,0 +1,11 @@
+"""The ground: terrain files, its reconstruction from a clip, and how a clip lies on it.
+
+`meshes` reads what trimesh reads, and heightfields (NPZ, NPY, PNG); it writes PLY, OBJ and STL.
+`reconstruction` estimates the ground below a clip from where its feet stood: it fits a plane, a
+thin plate, and level blocks on a grid, and chooses by cross-validation. `ground_path` is the ground
+along the way of a body, `coverage` tells how much of a clip's ground there is, and `ground_patch`
+is what a picture shows of it.
+
+Rays and contact are not computed here but in `jaxik.world.terrain`. Start with
+`meshes.load_terrain`, or with `reconstruction.reconstruct`.
+"""

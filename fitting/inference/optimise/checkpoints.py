@@ -1,0 +1,302 @@
+"""The finished stages of searches and profiles, in a file from which a killed process goes on.
+
+A stage follows from the state before it and from nothing else that changes. So a search that is
+begun again takes the ends of its first stages from the file, in their order, and computes the
+others: what comes out is to the last bit what the search would have found in one go. Jacobians are
+computed again, where they are needed.
+
+A fit makes several searches: each has its own list of stages, under a digest of all that it follows
+from. Of the profiles of a solution only the last stage is kept, which holds all before it. The file
+belongs to one fit, which its identity names; stages of another are not used.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypedDict
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.problem.problem import Problem, digest_with
+from fitting.runtime import program_cache
+from fitting.runtime.json_files import Finite, JsonFile, between, length
+from fitting.runtime.validation import Content, in_one_line
+
+from .solution import Elite, Point, Progress, Search, SearchState, Stage, StepsUsedUp
+
+# What a state with the right names and types raises where its numbers make no sense.
+DAMAGES = (ValueError, TypeError, KeyError, OverflowError)
+SECONDS_BETWEEN_WRITES = 1.0  # a kill loses no more than these and the stage that is running
+
+
+class StoredPoint(TypedDict):
+    """A point without its Jacobian."""
+
+    u: list[Finite]
+    cost: float
+
+
+class StoredElite(TypedDict):
+    """The elite of an evolution."""
+
+    u: list[list[Finite]]
+    cost: list[float]
+
+
+class StoredStage(TypedDict):
+    """The state in which a stage ended, as far as stages change it."""
+
+    name: str
+    point: StoredPoint
+    best: StoredPoint
+    random: Content
+    """State of the random generator."""
+    converged: bool
+    start_steps: int
+    steps: int
+    sweeps: int
+    elite: StoredElite | None
+    history: list[Annotated[Content, Progress]]
+    """The lines that the stage added."""
+    used_up: bool
+    """Whether it ended because the start had no steps left."""
+
+
+class StoredPoints(TypedDict):
+    """Points of a profile."""
+
+    u: list[list[Finite]]
+    values: list[list[Finite]]
+    cost: list[float]
+
+
+class StoredProfiles(TypedDict):
+    """The profiles of a solution as they were after some stages."""
+
+    stages: Annotated[int, between(0, 100)]
+    """Finished ones."""
+    curves: list[StoredPoints]
+    """Of each parameter."""
+    plateaus: StoredPoints
+    cliffs: list[Annotated[list[Finite], length(2)]]
+    """At which nothing is tried again: index of the parameter, fraction of its range."""
+    crossed: bool
+    """Whether no further cliff can be crossed."""
+    random: Content
+    """State of the random generator."""
+
+
+class StoredSearches(TypedDict):
+    """The content of the file."""
+
+    identity: str
+    """Of the fit."""
+    searches: dict[str, list[StoredStage]]
+    profiles: dict[str, StoredProfiles]
+
+
+FILE = JsonFile(
+    StoredSearches,
+    "the state of a search",
+    "it is left alone and the search begins anew",
+    indent=None,
+)
+
+
+class KeptStages:
+    """The stages of the searches and profiles of one fit, in memory and in a file."""
+
+    def __init__(
+        self, path: Path, identity: str, warn: Callable[[str], object] = lambda reason: None
+    ):
+        """Reads the stages that a killed process has left.
+
+        Args:
+            path: the file; written when a stage is finished.
+            identity: of the fit. Stages of another one, or of another version of this program, are
+                not used.
+            warn: called with one sentence where there are stages that cannot be used.
+        """
+        identity = f"{identity} {program_cache.sources()} {dict(program_cache.versions())}"
+        self.path, self._warn = path, warn
+        self._content: StoredSearches = {
+            "identity": identity,
+            "searches": {},
+            "profiles": {},
+        }
+        self._written = -np.inf
+        if not path.exists():
+            return
+        try:
+            stored = FILE.read(path)
+        except ValueError as error:
+            warn(f"{error}")
+            return
+        if stored["identity"] == identity:
+            self._content = stored
+        else:
+            warn(f"{path}: the state of another fit, or of another version; the fit begins anew")
+
+    @property
+    def count(self) -> int:
+        """Number of stages, of all searches."""
+        return sum(map(len, self._content["searches"].values()))
+
+    @property
+    def profile_count(self) -> int:
+        """Number of stages of profiles."""
+        return sum(stored["stages"] for stored in self._content["profiles"].values())
+
+    def recall_profiles(
+        self,
+        problem: Problem,
+        u: Float[np.ndarray, " free"],
+        restore: Callable[[StoredProfiles], None],
+    ) -> Callable[[StoredProfiles], None]:
+        """Calls `restore` with the profiles of a solution, where some of their stages are stored.
+
+        Args:
+            problem: what was fitted.
+            u: of the solution.
+            restore: takes the profiles over, or raises one of `DAMAGES`.
+
+        Returns:
+            What keeps the profiles, to be called after every stage.
+        """
+        profiles, key = self._content["profiles"], digest_with(problem, u.tolist())[:16]
+        if key in profiles:
+            try:
+                restore(profiles[key])
+            except DAMAGES as error:
+                self._warn(f"{self.path}: damaged ({in_one_line(error)}); the profiles begin anew")
+                del profiles[key]
+
+        def keep(stored: StoredProfiles) -> None:
+            profiles[key] = stored
+            self._write()
+
+        return keep
+
+    def attach(self, search: Search, state: SearchState, starts: int) -> Search:
+        """The search with its stages recalled from here, and kept here."""
+        first = (state.best.u.tolist(), state.random.bit_generator.state)
+        key = digest_with(search.problem, search.settings, first, starts)[:16]
+        stages = self._content["searches"].setdefault(key, [])
+        try:
+            for stage in stages:
+                _check(stage, state)
+        except DAMAGES as error:
+            self._warn(f"{self.path}: damaged ({in_one_line(error)}); the search begins anew")
+            stages.clear()
+        lines = [line for stage in stages for line in stage["history"]]
+        elapsed = lines[-1]["seconds"] if lines else 0.0
+        recall = _Recall(stages, self._write)
+        return dataclasses.replace(search, began=search.began - elapsed, recall=recall)
+
+    def flush(self) -> None:
+        """Writes what is not on disk yet."""
+        if self.count or self.profile_count:
+            FILE.write(self.path, self._content)
+            self._written = time.monotonic()
+
+    def remove(self) -> None:
+        """Deletes the file: the fit is finished."""
+        self.path.unlink(missing_ok=True)
+
+    def _write(self) -> None:
+        if time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES:
+            self.flush()
+
+
+@dataclasses.dataclass
+class _Recall:
+    """Gives a search the ends of its stages, first those that are stored."""
+
+    stages: list[StoredStage]
+    write: Callable[[], None]
+    position: int = 0
+
+    def __call__(self, search: Search, name: str, state: SearchState, stage: Stage) -> SearchState:
+        stored = self.stages[self.position] if self.position < len(self.stages) else None
+        self.position += 1
+        if stored is not None:
+            after = _restored(stored, state)
+            search.observe(after)
+            if stored["used_up"]:
+                raise StepsUsedUp(after)
+            return after
+        try:
+            after = stage()
+        except StepsUsedUp as error:
+            self._keep(name, state, error.state, used_up=True)
+            raise
+        self._keep(name, state, after)
+        return after
+
+    def _keep(
+        self, name: str, before: SearchState, after: SearchState, *, used_up: bool = False
+    ) -> None:
+        added = after.history[len(before.history) :]
+        elite = after.elite
+        self.stages.append(
+            {
+                "name": name,
+                "point": _stored_point(after.point),
+                "best": _stored_point(after.best),
+                "random": dict(after.random.bit_generator.state),
+                "converged": after.converged,
+                "start_steps": after.start_steps,
+                "steps": after.steps,
+                "sweeps": after.sweeps,
+                "elite": elite and {"u": elite.u.tolist(), "cost": elite.cost.tolist()},
+                "history": [dataclasses.asdict(line) for line in added],
+                "used_up": used_up,
+            }
+        )
+        self.write()
+
+
+def _stored_point(point: Point) -> StoredPoint:
+    return {"u": point.u.tolist(), "cost": point.cost}
+
+
+def _restored(stored: StoredStage, before: SearchState) -> SearchState:
+    """The state after a stage."""
+    random = np.random.default_rng()
+    random.bit_generator.state = stored["random"]
+    elite = stored["elite"]
+    return dataclasses.replace(
+        before,
+        point=_point(stored["point"], before),
+        best=_point(stored["best"], before),
+        random=random,
+        converged=stored["converged"],
+        start_steps=stored["start_steps"],
+        steps=stored["steps"],
+        sweeps=stored["sweeps"],
+        elite=elite and Elite(np.array(elite["u"]), np.array(elite["cost"])),
+        history=(*before.history, *(_line(line) for line in stored["history"])),
+    )
+
+
+def _check(stored: StoredStage, state: SearchState) -> None:
+    """Raises one of `DAMAGES` for a stage that is none of this search."""
+    restored, size = _restored(stored, state), len(state.point.u)
+    elite = np.empty((0, size)) if restored.elite is None else restored.elite.u
+    if {len(restored.point.u), len(restored.best.u), elite.shape[-1]} != {size}:
+        raise ValueError(f"a point has not {size} numbers")
+
+
+def _point(stored: StoredPoint, before: SearchState) -> Point:
+    """The point; one that the search has met just now keeps its Jacobian."""
+    u = np.array(stored["u"])
+    for known in (before.best, before.point):
+        if np.array_equal(u, known.u) and stored["cost"] == known.cost:
+            return known
+    return Point(u, stored["cost"])
+
+
+def _line(stored: Any) -> Progress:
+    return Progress(**stored)

@@ -1,0 +1,38 @@
+"""Whole jobs, from files to a folder with results and a report: what the command line runs.
+
+Each job checks everything the user gave before it computes anything, writes its results as soon as
+they exist, and draws its report last. Without an `output` nothing is written. `progress` is called
+with reports of a running search or sampling; `log` with lines and tables as the command line prints
+them, so `log=print` shows the same.
+
+Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
+bits; a system that was made in 32 bits is taken with the values it has there.
+
+`drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample` and
+`translate`. `ablations` leaves rules out: `ablate`. `calibrations` judges what fits say:
+`calibrate` and
+`calibrate_wrong_model`. `populations` fits several clips and subjects: `population`. `many`
+fits clips × experiments × seeds in other processes: `fit_many`. `animations` runs finished
+systems: `solve`, `apply`, `compare` and `run_suite`. `views` shows runs, clips and fits in the
+browser: `view`, `view_run`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes
+parameters for others: `export`. `examples` copies the experiments that come with the package.
+"""
+
+from .studies.ablation import ablate as ablate
+from .studies.animations.animation_jobs import apply as apply
+from .studies.animations.animation_jobs import compare as compare
+from .studies.animations.animation_jobs import run_suite as run_suite
+from .studies.animations.animation_jobs import solve as solve
+from .studies.calibrate.calibration_jobs import calibrate as calibrate
+from .studies.calibrate.calibration_jobs import calibrate_wrong_model as calibrate_wrong_model
+from .studies.drafts.draft_report import init as init
+from .studies.exports import export as export
+from .studies.fit.fit_jobs import fit as fit
+from .studies.fit.fit_jobs import sample as sample
+from .studies.fit.fit_jobs import translate as translate
+from .studies.many.fit_many import fit_many as fit_many
+from .studies.output import Log as Log
+from .studies.population.population_report import population as population
+from .studies.sample.run_comparison import compare_runs as compare_runs
+from .viewer.views import view as view
+from .viewer.views import view_run as view_run

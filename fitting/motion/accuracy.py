@@ -1,0 +1,311 @@
+"""How far a solved motion is from the captured one, in the figures of the blocks benchmark.
+
+The definitions are those of the benchmark's own scoring script, against which the tests check
+them. NumPy; world space, y up.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+import jaxik
+from fitting.clips.clip import Clip
+from fitting.clips.clip_frames import positions_by_role
+from fitting.problem.residuals import errors_by_kind, rotation_between
+from fitting.problem.scene import Scene, legs_ws, pelvis_ws
+from fitting.problem.shared_world import run_scene
+from fitting.runtime.precision import in_float64
+from fitting.runtime.program_cache import cached
+from jaxik.world.skeleton import Transform
+
+STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
+JOINTS = ("pelvis", "hip", "knee", "ankle")
+
+STANDING_SPEED = 0.02  # m/s; a slower character stands
+NEGLIGIBLE = 1e-4  # m or rad, rms; a smaller correction counts as none
+QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")  # positions, then orientations
+
+FITTED_JOINTS = ("pelvis", "knee", "ankle")
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How far a solved motion is from the captured one; NaN where no frame counts."""
+
+    pelvis: float
+    """m, height, rms."""
+    ankle: float
+    """m, rms."""
+    ankle_stance: float
+    """m, rms over the frames in which the captured foot stands."""
+    knee: float
+    """m, rms."""
+    knee_stance: float
+    """m, likewise."""
+    knee_angle: float
+    """rad, rms."""
+    knee_angle_stance: float
+    """rad, likewise."""
+    straight: float
+    """Fraction of frames and legs."""
+    pop: float
+    """m per frame, largest."""
+    added_slip: float
+    """m per frame, mean."""
+    bone_length: float
+    """m, largest error."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Frame by frame what `Accuracy` summarises; `changes` run from one frame to the next."""
+
+    pelvis: Float[np.ndarray, " frames"]
+    """m, height."""
+    ankle: Float[np.ndarray, "frames legs"]
+    """Metres."""
+    knee: Float[np.ndarray, "frames legs"]
+    """Metres."""
+    knee_angle: Float[np.ndarray, "frames legs"]
+    """Radians."""
+    stance: Bool[np.ndarray, "frames legs"]
+    straight: Bool[np.ndarray, "frames legs"]
+    lift: Float[np.ndarray, "changes legs"]
+    """m, change of the ankle's height over the animated one."""
+    slip: Float[np.ndarray, " standing"]
+    """m, horizontal, beyond the captured, of standing feet."""
+    bones: Float[np.ndarray, "frames legs 2"]
+    """m, of thigh and shin."""
+
+
+def errors(
+    solved: Mapping[str, np.ndarray],
+    captured: Mapping[str, np.ndarray],
+    animated_ankle_ws: Float[np.ndarray, "frames legs 3"],
+    stance: Bool[np.ndarray, "frames legs"],
+    lengths: Float[np.ndarray, "legs 2"],
+) -> Errors:
+    """Differences between two motions over the same frames.
+
+    Args:
+        solved: `pelvis` (frames, 3); `hip`, `knee` and `ankle` (frames, legs, 3), m.
+        captured: the same joints.
+        animated_ankle_ws: of the flat animation from which the solved motion was made, m.
+        stance: where a captured foot stands.
+        lengths: of thigh and shin, m.
+    """
+    ours, theirs = (
+        {name: joints[name].astype(np.float64) for name in JOINTS} for joints in (solved, captured)
+    )
+    our_steps, their_steps = (
+        np.linalg.norm(np.diff(joints["ankle"][..., [0, 2]], axis=0), axis=-1)
+        for joints in (ours, theirs)
+    )
+    thigh, shin = ours["knee"] - ours["hip"], ours["ankle"] - ours["knee"]
+    reach = np.linalg.norm(ours["ankle"] - ours["hip"], axis=-1)
+    return Errors(
+        pelvis=ours["pelvis"][:, 1] - theirs["pelvis"][:, 1],
+        ankle=np.linalg.norm(ours["ankle"] - theirs["ankle"], axis=-1),
+        knee=np.linalg.norm(ours["knee"] - theirs["knee"], axis=-1),
+        knee_angle=knee_angle(ours) - knee_angle(theirs),
+        stance=stance,
+        straight=reach / np.sum(lengths, axis=-1) >= STRAIGHT_REACH,
+        lift=np.diff((ours["ankle"] - animated_ankle_ws)[..., 1], axis=0),
+        slip=(our_steps - their_steps)[stance[1:] & stance[:-1]],
+        bones=np.linalg.norm(np.stack([thigh, shin], axis=2), axis=-1) - lengths,
+    )
+
+
+def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
+    """Differences between a solved clip and the captured one, over the same frames.
+
+    Args:
+        solved: what foot IK made of the animation.
+        captured: says when a foot stands, by its contact labels or else by its motion.
+        animation: the flat animation, whose bones have the lengths of its rig.
+    """
+    rig = animation.rig
+    return errors(
+        positions_by_role(solved),
+        positions_by_role(captured),
+        animation.joints_ws(2),
+        captured.stance_labels(),
+        np.stack([np.asarray(rig.thigh), np.asarray(rig.shin)], axis=-1),
+    )
+
+
+def knee_angle(joints: Mapping[str, np.ndarray]) -> Float[np.ndarray, "frames legs"]:
+    """Angle between thigh and shin, rad; pi for a straight leg."""
+    thigh, shin = joints["hip"] - joints["knee"], joints["ankle"] - joints["knee"]
+    across = np.linalg.norm(np.cross(thigh, shin), axis=-1)
+    return np.arctan2(across, np.sum(thigh * shin, axis=-1))
+
+
+def summarise(clips: Sequence[Errors]) -> Accuracy:
+    """The figures over all frames of all clips; no change is taken across a cut."""
+    joined = {
+        field.name: np.concatenate([getattr(clip, field.name).ravel() for clip in clips])
+        for field in fields(Errors)
+    }
+    stance = joined["stance"]
+    return Accuracy(
+        pelvis=_rms(joined["pelvis"]),
+        ankle=_rms(joined["ankle"]),
+        ankle_stance=_rms(joined["ankle"][stance]),
+        knee=_rms(joined["knee"]),
+        knee_stance=_rms(joined["knee"][stance]),
+        knee_angle=_rms(joined["knee_angle"]),
+        knee_angle_stance=_rms(joined["knee_angle"][stance]),
+        straight=_mean(joined["straight"]),
+        pop=_largest(joined["lift"]),
+        added_slip=_mean(np.maximum(joined["slip"], 0.0)),
+        bone_length=_largest(joined["bones"]),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if values.size else float("nan")
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.abs(values).max()) if values.size else float("nan")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Differences in one clip, by quantity; a column for each leg, or one for the body."""
+
+    legs: tuple[str, ...]
+    time: Float[np.ndarray, " frames"]
+    """Seconds."""
+    standing: Bool[np.ndarray, " frames"]
+    """Of the character, not of a foot."""
+    correction: Mapping[str, Float[np.ndarray, "frames columns"]]
+    """Reference - animation, m or rad."""
+    remaining: Mapping[str, Float[np.ndarray, "frames columns"]]
+    """Reference - system, m or rad."""
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What remains of the correction of one quantity, m or rad."""
+
+    correction: float
+    """Rms."""
+    rms: float
+    p95: float
+    """95th percentile."""
+    max: float
+
+    @property
+    def reproduced(self) -> float | None:
+        """1 - rms / correction: 1 for the same motion, 0 for one no better than the animation.
+
+        None where the reference corrects nothing.
+        """
+        return 1.0 - self.rms / self.correction if self.correction > NEGLIGIBLE else None
+
+
+def measure(scene: Scene, result: jaxik.Result) -> Difference:
+    """How far a system's result is from the scene's reference in each frame."""
+    present = np.asarray(scene.rig.present)
+    dt = np.asarray(scene.frames.dt)
+    return Difference(
+        legs=tuple(n for n, here in zip(scene.rig.names, present, strict=True) if here),
+        time=np.cumsum(dt) - dt[0],
+        standing=np.asarray(scene.frames.speed) <= STANDING_SPEED,
+        correction=correction(scene),
+        remaining=_distances(scene, pelvis_ws(scene, result), legs_ws(scene, result)),
+    )
+
+
+def correction(scene: Scene) -> dict[str, Float[np.ndarray, "frames columns"]]:
+    """How far the scene's reference is from its animation, by quantity, m or rad."""
+    world = scene.frames.world_from_model
+    legs = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
+    return _distances(scene, world @ scene.pelvis, legs)
+
+
+def _distances(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np.ndarray]:
+    """Distances of a motion from the scene's reference, m or rad."""
+    reference, present = scene.reference, np.asarray(scene.rig.present)
+
+    def length(vectors: Array) -> np.ndarray:
+        return np.linalg.norm(np.asarray(vectors), axis=-1)
+
+    def angle(a: Array, b: Array) -> np.ndarray:
+        return 2.0 * np.arcsin(np.minimum(0.5 * length(rotation_between(a, b)), 1.0))
+
+    return {
+        "ankle": length(legs.ankle.pos - reference.ankle.pos)[:, present],
+        "knee": length(legs.knee.pos - reference.knee_ws)[:, present],
+        "pelvis": length(pelvis.pos - reference.pelvis.pos)[:, None],
+        "foot": angle(reference.ankle.rot, legs.ankle.rot)[:, present],
+        "body": angle(reference.pelvis.rot, pelvis.rot)[:, None],
+    }
+
+
+def summarise_differences(clips: Sequence[Difference]) -> dict[str, dict[str, Remainder]]:
+    """What remains of each quantity, by phase: "all frames" of all clips.
+
+    Where the character stands in some frames and moves in others, these are also the phases
+    "standing" and "moving".
+    """
+    phases = {"all frames": _remainders(clips, [np.ones_like(clip.standing) for clip in clips])}
+    standing = [clip.standing for clip in clips]
+    if any(frames.any() for frames in standing) and not all(frames.all() for frames in standing):
+        phases["standing"] = _remainders(clips, standing)
+        phases["moving"] = _remainders(clips, [~frames for frames in standing])
+    return phases
+
+
+def _remainders(
+    clips: Sequence[Difference], chosen: Sequence[Bool[np.ndarray, " frames"]]
+) -> dict[str, Remainder]:
+    """What remains of each quantity over the chosen frames of each clip."""
+
+    def over_clips(series: Sequence[np.ndarray]) -> np.ndarray:
+        pairs = zip(series, chosen, strict=True)
+        return np.concatenate([values[frames].ravel() for values, frames in pairs])
+
+    remainders = {}
+    for quantity in QUANTITIES:
+        before = over_clips([clip.correction[quantity] for clip in clips])
+        after = over_clips([clip.remaining[quantity] for clip in clips])
+        remainders[quantity] = Remainder(
+            correction=float(np.sqrt(np.mean(before**2))),
+            rms=float(np.sqrt(np.mean(after**2))),
+            p95=float(np.percentile(after, 95)),
+            max=float(after.max()),
+        )
+    return remainders
+
+
+@in_float64
+def position_error(ik: jaxik.FootIK, scene: Scene) -> float:
+    """Distance of pelvis, knees and ankles from the captured ones, m, rms over joints and frames.
+
+    Frames that were not observed, and legs that the rig only has in name, do not count; NaN if
+    nothing is left.
+    """
+    squares, count = _squares(ik, scene)
+    return float(np.sqrt(squares / count)) if count else float("nan")
+
+
+@cached
+def _squares(ik: jaxik.FootIK, scene: Scene) -> tuple[Array, Array]:
+    """Sum of the squared distances, m², and their number."""
+    errors = errors_by_kind(scene, run_scene(ik, scene))
+    observed, legs = scene.reference.observed, jnp.sum(scene.rig.present)
+    each = [
+        jnp.sum(errors[joint].reshape(len(observed), -1) ** 2, axis=1) for joint in FITTED_JOINTS
+    ]
+    total = jnp.sum(jnp.where(observed, sum(each), 0.0))
+    return total, jnp.sum(observed) * (1 + 2 * legs)

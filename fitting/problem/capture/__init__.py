@@ -1,1 +1,0 @@
-"""What is not known of a capture, fitted beside a system. Start with `parameters.Capture`."""

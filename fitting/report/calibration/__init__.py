@@ -1,1 +1,0 @@
-"""The report of a calibration: text, tables and pictures of what was found in all replicates."""

@@ -1,1 +1,0 @@
-"""Goodness of fit in words and tables. Start with `goodness_report.section`."""

@@ -1,1 +1,0 @@
-"""The report of a population: text, tables and a picture of clips that were fitted together."""

@@ -1,0 +1,222 @@
+"""Motions and ground as the page's scripts read them: small integers in base64.
+
+Joints are relative to the pelvis of their own motion, in steps of less than a tenth of a
+millimetre for a body of 2 m; the pelvis itself has 32-bit floats, relative to a corner near the
+path. Ground is in steps of a 65,534th of its range.
+"""
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from fitting.ground.ground_patch import GroundPatch
+from fitting.motion.measures import PlacedMotion
+from jaxik.world import body
+
+from . import style
+
+MAX_RATE = 60.0  # frames per second that are shown
+MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 adds a third
+MAX_GROUND_BYTES = 900_000  # of these, of the grounds
+LARGEST = 32_767  # of a 16-bit integer
+HOLE = 65_535  # in place of a height, where there is no ground
+
+
+class Look(NamedTuple):
+    """How a skeleton is drawn."""
+
+    colour: str
+    """As `#rrggbb`."""
+    radius: float
+    """Of its bones, m for an adult."""
+    opacity: float = 1.0
+    """Below 1 it is a shell of glass."""
+
+
+ANIMATED = Look(style.SLIDING, 0.012)
+BEFORE = Look(style.BEFORE, 0.015)
+CAPTURED = Look(style.CAPTURED, 0.034, 0.1)  # around what should be inside it
+FITTED = Look(style.AFTER, 0.02)
+
+
+@dataclass(frozen=True)
+class ShownMotion:
+    """A motion as the page shows it."""
+
+    label: str
+    motion: PlacedMotion
+    look: Look
+    visible: bool = False
+    """At first; the legend shows and hides it."""
+    worst: tuple[int, int] | None = None
+    """First and last frame of its worst seconds; None for one that cannot be watched."""
+
+
+@dataclass(frozen=True)
+class ShownClip:
+    """What the page shows of one clip."""
+
+    motions: Mapping[str, ShownMotion]
+    """By a key that is the same in all clips."""
+    stance: Bool[np.ndarray, "frames legs"]
+    ground: GroundPatch
+    watched: str
+    """Key of the motion that is watched at first."""
+
+    @property
+    def reference(self) -> PlacedMotion:
+        """The motion that gives frame rate, body and direction: the first one, as it was played."""
+        return next(iter(self.motions.values())).motion
+
+
+def pack(clips: Sequence[ShownClip], spent: int = 0) -> list[dict[str, Any]]:
+    """All clips of a page, with so few frames and so coarse a ground that it stays small.
+
+    Args:
+        clips: what is shown.
+        spent: bytes of the page's pictures.
+    """
+    grounds = coarse_grounds([clip.ground for clip in clips])
+    room = MAX_BYTES - spent - sum(map(_ground_bytes, grounds))
+    steps = steps_between_frames(clips, room)
+    return [
+        _pack_clip(clip, ground, step)
+        for clip, ground, step in zip(clips, grounds, steps, strict=True)
+    ]
+
+
+def steps_between_frames(clips: Sequence[ShownClip], room: int = MAX_BYTES) -> list[int]:
+    """How many frames of each clip make one on the page, for motions of so many bytes in all."""
+    frames = [len(clip.stance) for clip in clips]
+    steps = [max(1, math.ceil(clip.reference.clip.fps / MAX_RATE - 0.01)) for clip in clips]
+    sizes = [sum(_motion_bytes(shown.motion) for shown in clip.motions.values()) for clip in clips]
+    while sum(size / step for size, step in zip(sizes, steps, strict=True)) > room:
+        if all(step >= count for step, count in zip(steps, frames, strict=True)):
+            break  # one frame is left of each
+        steps = [2 * step for step in steps]
+    return steps
+
+
+def coarse_grounds(grounds: Sequence[GroundPatch]) -> list[GroundPatch]:
+    """The grounds, all with so few heights that together they take `MAX_GROUND_BYTES` at most."""
+    every = 1
+    while sum(map(_ground_bytes, grounds)) > MAX_GROUND_BYTES * every**2:
+        every += 1
+    return [
+        GroundPatch(ground.corner, every * ground.spacing, ground.heights[::every, ::every])
+        for ground in grounds
+    ]
+
+
+def _ground_bytes(ground: GroundPatch) -> int:
+    return 2 * ground.heights.size
+
+
+def _motion_bytes(motion: PlacedMotion) -> int:
+    frames, legs = motion.in_ground.shape
+    return 2 * _points(motion).size + frames * (12 + legs)
+
+
+def _pack_clip(clip: ShownClip, ground: GroundPatch, step: int) -> dict[str, Any]:
+    reference = clip.reference.clip
+    corner = np.append(ground.corner, _lowest(ground, clip.reference))[[0, 2, 1]]
+    return {
+        "rate": reference.fps / step,
+        "frames": len(range(0, reference.frame_count, step)),
+        "size": float(body.ratio(reference.rig)),
+        "legs": list(reference.rig.names),
+        "forward": _travel(reference.positions_ws[:, reference.rig.pelvis]),
+        "stance": _bytes(_any_of(clip.stance, step)),
+        "watched": clip.watched,
+        "skeletons": [
+            {"key": key, **_pack_look(shown, step), **_pack_motion(shown.motion, step, corner)}
+            for key, shown in clip.motions.items()
+        ],
+        "ground": _pack_ground(ground, corner),
+    }
+
+
+def _pack_look(shown: ShownMotion, step: int) -> dict[str, Any]:
+    worst = shown.worst
+    return {
+        "label": shown.label,
+        **shown.look._asdict(),
+        "visible": shown.visible,
+        "worst": None if worst is None else {"start": worst[0] // step, "end": worst[1] // step},
+    }
+
+
+def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[str, Any]:
+    clip = motion.clip
+    points = _points(motion)[::step]
+    root = points[:, clip.rig.pelvis].copy()
+    offsets = points - root[:, None]
+    quantum = max(float(np.abs(offsets).max()), 1e-6) / LARGEST
+    joints = len(clip.joint_names)
+    soles = [[joints + 2 * leg, joints + 2 * leg + 1] for leg in range(len(clip.rig.names))]
+    return {
+        "points": points.shape[1],
+        "bones": [[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0],
+        "pelvis": clip.rig.pelvis,
+        "legs": [list(map(int, leg)) for leg in clip.rig.joints],
+        "soles": soles,
+        "quantum": quantum,
+        "root": _base64((root - corner).astype("<f4")),
+        "offsets": _base64(np.round(offsets / quantum).astype("<i2")),
+        "inGround": _bytes(_any_of(motion.in_ground, step)),
+    }
+
+
+def _points(motion: PlacedMotion) -> np.ndarray:
+    """Joints and, after them, both points of each sole, m: (frames, points, 3)."""
+    frames = len(motion.soles_ws)
+    return np.concatenate([motion.clip.positions_ws, motion.soles_ws.reshape(frames, -1, 3)], 1)
+
+
+def _pack_ground(ground: GroundPatch, corner: np.ndarray) -> dict[str, Any]:
+    known = np.isfinite(ground.heights)
+    low = float(np.min(ground.heights, where=known, initial=np.inf)) if known.any() else 0.0
+    high = float(np.max(ground.heights, where=known, initial=-np.inf)) if known.any() else 0.0
+    quantum = max(high - low, 1e-6) / (HOLE - 1)
+    steps = np.where(known, np.round((np.nan_to_num(ground.heights) - low) / quantum), HOLE)
+    return {
+        "rows": len(steps),
+        "columns": len(steps[0]),
+        "spacing": ground.spacing,
+        "low": low - float(corner[1]),
+        "quantum": quantum,
+        "heights": _base64(steps.astype("<u2")),
+    }
+
+
+def _lowest(ground: GroundPatch, motion: PlacedMotion) -> float:
+    """Height of the lowest known ground, m, or else of the lowest sole of a motion."""
+    known = np.isfinite(ground.heights)
+    return float(np.nanmin(ground.heights if known.any() else motion.soles_ws))
+
+
+def _travel(pelvis: np.ndarray) -> list[float]:
+    """The direction in x and z in which a pelvis gets furthest; z where it stays in place."""
+    offsets = (pelvis - pelvis[0])[:, [0, 2]]
+    furthest = offsets[int(np.argmax(np.linalg.norm(offsets, axis=1)))]
+    distance = float(np.linalg.norm(furthest))
+    return [0.0, 1.0] if distance < 0.2 else (furthest / distance).tolist()
+
+
+def _any_of(marks: np.ndarray, step: int) -> np.ndarray:
+    """Marks of every `step`-th frame; one between two that are shown counts for the first."""
+    marks = np.pad(marks, [(0, -len(marks) % step), (0, 0)])
+    return np.any(marks.reshape(-1, step, marks.shape[1]), axis=1)
+
+
+def _bytes(marks: np.ndarray) -> str:
+    return _base64(marks.astype(np.uint8))
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")

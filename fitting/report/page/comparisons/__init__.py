@@ -1,1 +1,0 @@
-"""Pages of comparisons: of systems on a clip, of systems in the suite, and of sampled runs."""

@@ -1,1 +1,0 @@
-"""Pages of jobs that fit many times: ablations, populations and calibrations."""

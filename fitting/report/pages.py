@@ -1,0 +1,294 @@
+"""The page of a job other than a fit: sections of sentences, tables and pictures."""
+
+import base64
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+from PIL import Image
+
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.runtime import files
+
+from . import motion_data, style
+from .formatting import Table
+from .motion_data import ShownClip
+
+PACKAGE = "fitting.report"
+PAGE = "report.html"  # in the folder of a run
+STYLES = ("page.css", "viewer.css")
+SCRIPTS = ("theme.js",)
+VIEWER_SCRIPTS = (  # in the order in which they use each other
+    "matrices.js",
+    "skeletons.js",
+    "shaders.js",
+    "stage.js",
+    "camera.js",
+    "timeline.js",
+    "player.js",
+)
+COLOURS = {  # of the plots, as variables of the style sheet
+    "captured": style.CAPTURED,
+    "fitted": style.AFTER,
+    "before": style.BEFORE,
+    "determined": style.PRIOR,
+}
+
+MAX_BYTES = 2_500_000  # of all pictures of a page
+SMALLER = 0.8  # of its width, as often as it takes
+
+
+def render(template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
+    """A page as HTML. What is not marked as HTML is escaped.
+
+    Args:
+        template: name of the file in `templates`.
+        clips: what the view shows, as `motion_data.pack` gives it; none for a page without a view.
+        content: the template's variables.
+    """
+    scripts = (*SCRIPTS, *VIEWER_SCRIPTS) if clips else SCRIPTS
+    return fragment(
+        template,
+        **content,
+        data=as_json({"clips": clips}),
+        colours=COLOURS,
+        version=metadata.version("jaxik"),
+        style=Markup(_assets(STYLES)),
+        script=Markup(_assets(scripts)),
+    )
+
+
+def fragment(template: str, **content: Any) -> str:
+    """A part of a page as HTML. What is not marked as HTML is escaped."""
+    return _environment().get_template(template).render(**content)
+
+
+def write(path: Path, template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> None:
+    """Writes a page; see `render`."""
+    files.write_text(path, render(template, clips, **content))
+
+
+def prose(text: str) -> Markup:
+    """A sentence or a cell as HTML: what Markdown marks as code or as strong is so."""
+    html = str(escape(text))
+    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", html)
+    return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", html))
+
+
+def as_json(data: Any) -> Markup:
+    """JSON that can stand in a script element: no text in it can end the element."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader(PACKAGE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["prose"] = prose
+    return environment
+
+
+def _assets(names: tuple[str, ...]) -> str:
+    folder = resources.files(PACKAGE) / "assets"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+class Picture(NamedTuple):
+    """A picture that is part of a page."""
+
+    caption: str
+    source: str
+    """As a data URL."""
+    width: int
+    height: int
+    size: int
+    """Bytes, before base64."""
+    kind: str = "picture"
+
+
+def embed(folder: Path, captions: Mapping[str, str]) -> list[Picture]:
+    """Pictures of a folder, those that are too large scaled down: all are `MAX_BYTES` at most.
+
+    Args:
+        folder: that has them, as PNG.
+        captions: by file name; files that do not exist are left out.
+    """
+    paths = [folder / name for name in captions if (folder / name).is_file()]
+    room = MAX_BYTES // max(len(paths), 1)
+    return [_embed(path, captions[path.name], room) for path in paths]
+
+
+def _embed(path: Path, caption: str, room: int) -> Picture:
+    content = path.read_bytes()
+    with Image.open(path) as original:
+        size = original.size
+        while len(content) > room:
+            size = max(1, round(SMALLER * size[0])), max(1, round(SMALLER * size[1]))
+            file = io.BytesIO()
+            original.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(file, "PNG")
+            content = file.getvalue()
+    encoded = base64.b64encode(content).decode("ascii")
+    return Picture(caption, f"data:image/png;base64,{encoded}", *size, len(content))
+
+
+class Text(NamedTuple):
+    """A paragraph; what is `code` or **strong** in Markdown is so."""
+
+    text: str
+    kind: str = "text"
+
+
+class Points(NamedTuple):
+    """A list of sentences."""
+
+    lines: Sequence[str]
+    kind: str = "points"
+
+
+class Terms(NamedTuple):
+    """Names and what they mean."""
+
+    rows: Sequence[Sequence[str]]
+    kind: str = "terms"
+
+
+class Grid(NamedTuple):
+    """A table; a cell that ends with an exclamation mark is shown as a miss."""
+
+    rows: Table
+    label: str
+    """For those who do not see it."""
+    title: str = ""
+    kind: str = "grid"
+
+
+class Jump(NamedTuple):
+    """A button that shows the worst seconds of a motion in the view."""
+
+    words: str
+    clip: int
+    """Its number among the clips of the view, from 0."""
+    key: str
+    """Of the motion."""
+    kind: str = "jump"
+
+
+Block: TypeAlias = Text | Points | Terms | Grid | Jump | Picture
+
+
+class Finding(NamedTuple):
+    """A sentence that says what was found."""
+
+    text: str
+    bad: bool = False
+    """Whether it says what went badly."""
+
+
+class Section(NamedTuple):
+    """A heading, and what stands below it."""
+
+    heading: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class View:
+    """The motion in 3-D."""
+
+    clips: Sequence[ShownClip]
+    names: Sequence[str]
+    """Of the clips."""
+    visible: str
+    """From which depth on a sole in the ground is marked, with its unit."""
+
+
+@dataclass(frozen=True)
+class StudyPage:
+    """All that a page says."""
+
+    kind: str
+    """What was done, in a few words."""
+    title: str
+    verdict: str
+    """In two or three words."""
+    good: bool
+    """Whether the verdict is good news."""
+    findings: Sequence[Finding]
+    """Three; the page begins with those that say what went badly."""
+    sections: Sequence[Section]
+    asked: Table
+    """What was asked, a name and a text each."""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """What is in which file beside the page, by file name."""
+    view: View | None = None
+
+    def write(self, folder: Path) -> None:
+        """Writes the page into a folder."""
+        pictures = [
+            block
+            for section in self.sections
+            for block in section.blocks
+            if isinstance(block, Picture)
+        ]
+        spent = sum(picture.size for picture in pictures)
+        clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
+        write(
+            folder / PAGE,
+            "study.html",
+            clips,
+            page=self,
+            title=self.title,
+            findings=[f.text for f in sorted(self.findings, key=lambda f: not f.bad)],
+        )
+
+
+def system(experiment: Experiment) -> str:
+    """Its preset, with rules that are not the preset's."""
+    rules = [f"{stage} by {rule}" for stage, rule in experiment.rules.items()]
+    preset = experiment.preset + (", faithful to its original" if experiment.faithful else "")
+    return ", ".join([preset, *rules])
+
+
+def loss_and_seed(experiment: Experiment) -> list[str]:
+    """A row with what else decides a fit."""
+    return ["Loss and seed", f"{experiment.loss}, {experiment.seed}"]
+
+
+def rows(experiment: Experiment) -> Table:
+    """A name and a text each: the system, what is free, the clips, the loss."""
+    free = ", ".join(f"`{name}`" for name in experiment.free) or "none"
+    table = [
+        ["System", system(experiment)],
+        [f"Free parameters ({len(experiment.free)})", free],
+    ]
+    if experiment.capture:
+        of_capture = ", ".join(f"`{name}`" for name in experiment.capture)
+        table.append([f"Of the captures ({len(experiment.capture)})", of_capture])
+    for number, entry in enumerate(experiment.clips, 1):
+        heading = f"Clip {number}" if len(experiment.clips) > 1 else "Clip"
+        table.append([heading, _clip(entry)])
+    return [*table, loss_and_seed(experiment)]
+
+
+def _clip(entry: ClipEntry) -> str:
+    text = f"{entry.reference.name} on {entry.terrain.name}"
+    if entry.start or entry.end is not None:
+        end = "the end" if entry.end is None else f"{entry.end:g} s"
+        text += f", from {entry.start:g} s to {end}"
+    base = "made from it" if entry.base is None else entry.base.name
+    subject = "" if entry.subject is None else f"; subject {entry.subject}"
+    return f"{text}; flat animation {base}{subject}"

@@ -1,1 +1,0 @@
-"""The suite in words, tables and pictures. Start with `suite_report.write`."""

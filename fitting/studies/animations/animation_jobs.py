@@ -1,0 +1,188 @@
+"""Jobs that run finished systems on flat animations, and measure what comes out."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+
+import numpy as np
+
+import jaxik
+from fitting.clips import Clip, flight, save_clip
+from fitting.clips.formats.saving import check_clip_file
+from fitting.ground.meshes import mesh_of
+from fitting.motion import accuracy
+from fitting.report.formatting import aligned, joined, transposed
+from fitting.runtime import activity
+from fitting.runtime.precision import in_float64, with_floats
+from fitting.studies.compare import comparison, comparison_report
+from fitting.studies.compare.comparison import Comparison
+from fitting.studies.fit import fit_tables, run_folder
+from fitting.studies.output import Log, log_output, output_folder, silent
+from fitting.studies.suite import suite, suite_report
+from fitting.studies.suite.suite import Plan, Suite, SystemsOf
+
+from . import animations, placement_report
+from .animations import AnimationFiles, load_animation
+
+
+@in_float64
+def compare(
+    systems: Mapping[str, jaxik.FootIK],
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    rates: Sequence[float] = (),
+    during: Callable[[str], AbstractContextManager] = nullcontext,
+    log: Log = silent,
+) -> Comparison:
+    """Runs several systems on a flat animation and measures them side by side; warns as `solve`.
+
+    Args:
+        systems: by name.
+        animation: the clip, the terrain, and where the root is put for all systems.
+        output: folder for the table, the numbers, the figure and the page.
+        rates: Hz, at which each system runs too, to see how much its motion depends on them.
+        during: makes a context for the run of each system, from its name.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: a file cannot be read, a system does not fit the clip or gives poses that are
+            not finite, a rate is above the clip's, or the folder cannot be made.
+    """
+    with output_folder(output) as folder:
+        systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
+        title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
+        loaded = load_animation(animation)
+        compared = comparison.compare(systems, loaded, title=title, during=during)
+        differences = animations.measure(systems, loaded, rates, during)
+        compared = dataclasses.replace(compared, rates=differences)
+        if folder is not None:
+            with activity.announced("Drawing the comparison"):
+                comparison_report.write(folder, compared)
+                comparison_report.write_page(folder, compared)
+        table = aligned(transposed(comparison_report.table(compared)))
+        where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
+        where += [f"note: {remark}" for remark in loaded.clip.remarks]
+        log(joined([table, "", *filter(None, where)]))
+        if differences:
+            log(joined(["", aligned(comparison_report.rate_table(compared))]))
+        log_output(log, folder, comparison_report.TABLE)
+        for name, (placement, cause) in compared.placements.items():
+            placement_report.warn(placement, cause, name)
+        return compared
+
+
+@in_float64
+def run_suite(
+    systems_of: SystemsOf,
+    plan: Plan,
+    output: str | Path | None = None,
+    *,
+    during: Callable[[str], AbstractContextManager] = nullcontext,
+    log: Log = silent,
+) -> Suite:
+    """Runs systems through made situations and measures each against stated bounds.
+
+    KeyboardInterrupt (Ctrl-C) ends the suite; the finished situations are written and returned,
+    with `interrupted` set.
+
+    Args:
+        systems_of: makes systems for the body of a rig, by name.
+        plan: which situations; see `studies.suite.suite.choose`.
+        output: folder for the table, the numbers, the pictures and the page.
+        during: makes a context for each situation, from its name.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: the folder cannot be made.
+    """
+    with output_folder(output) as folder:
+        finished = suite.run_suite(systems_of, plan, during=during)
+        if finished.interrupted:
+            log("interrupted; drawing and writing the finished situations")
+        if folder is not None:
+            with activity.announced("Drawing the situations"):
+                suite_report.write(folder, finished)
+                suite_report.write_page(folder, finished)
+        log(suite_report.text(finished))
+        log_output(log, folder, suite_report.TABLE)
+        return finished
+
+
+@in_float64
+def apply(
+    run: str | Path,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    with_terrain: bool = False,
+    log: Log = silent,
+) -> Clip:
+    """Solves a flat animation with the fitted system of a run; see `solve`.
+
+    Raises:
+        ValueError: as `solve`, or the folder holds no finished fit.
+    """
+    ik = run_folder.load_fitted_system(Path(run), animation.flat_clip.rig)
+    return solve(ik, animation, output, with_terrain=with_terrain, log=log)
+
+
+@in_float64
+def solve(
+    ik: jaxik.FootIK,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    with_terrain: bool = False,
+    log: Log = silent,
+) -> Clip:
+    """Solves a flat animation, and measures how its feet are placed on the ground.
+
+    Where a captured motion is known, the log also shows the difference. Feet that are visibly off
+    the ground, slide or pop are a warning, with the most likely cause.
+
+    Args:
+        ik: the system.
+        animation: the clip, the terrain, and where the root is put.
+        output: .npz, .bvh, .glb or .csv file for the solved clip; see `save_clip`.
+        with_terrain: whether a .glb gets the terrain beside the skeleton.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: a file cannot be read or written, or the system does not fit the clip or gives
+            poses that are not finite.
+    """
+    path = None if output is None else Path(output)
+    if path is not None:
+        check_clip_file(path, with_ground=with_terrain)
+        if path.exists() and path.samefile(animation.clip):
+            raise ValueError(f"{path}: is the clip that is read; name another file")
+    ik, loaded = with_floats(ik, np.float64), load_animation(animation)
+    if path is not None:
+        check_clip_file(path, loaded.clip)
+    loaded.check_shapes(ik)
+    began = time.perf_counter()
+    with activity.announced("Compiling and running the system"):
+        result, solved = loaded.solve(ik)
+    seconds = time.perf_counter() - began
+    with activity.announced("Measuring how the feet are placed"):
+        placement, cause = loaded.assess(solved)
+    if path is not None:
+        joints = placement_report.arrays(solved, placement)
+        ground = mesh_of(loaded.terrain) if with_terrain else None
+        save_clip(path, solved, joints=joints, ground=ground)
+    log(placement_report.solved_text(loaded.reached(result), seconds, path))
+    where = [
+        f"root: {loaded.root.reason}",
+        flight.describe(loaded.clip),
+        placement_report.trunk_text(result, solved),
+        *(f"note: {remark}" for remark in loaded.clip.remarks),
+    ]
+    log(joined([*filter(None, where), "", placement_report.text(placement)]))
+    if loaded.captured is not None:
+        errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
+        log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
+    placement_report.warn(placement, cause)
+    return solved

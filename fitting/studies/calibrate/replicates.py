@@ -1,0 +1,279 @@
+"""One replicate: a truth drawn from the prior, motion simulated from it, and its fit.
+
+Everything follows from the experiment and the number of the replicate. What a replicate was found
+to be is plain data, which JSON holds without loss.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated, NamedTuple, NotRequired, TypedDict
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+import jaxik
+from fitting.experiment.experiment import Experiment
+from fitting.inference.noise import NoiseModel, noise_of, with_noise
+from fitting.inference.optimise import descent
+from fitting.inference.optimise.solution import (
+    Progress,
+    Search,
+    SearchSettings,
+    SearchState,
+    StepsUsedUp,
+)
+from fitting.inference.profiles.profile import Profile, level_of
+from fitting.inference.sample.posterior import Posterior, SamplingProgress
+from fitting.problem.problem import Problem
+from fitting.problem.simulation import simulate
+from fitting.problem.space import FreeParameter, to_fractions
+from fitting.runtime.json_files import Finite, between, length
+from fitting.runtime.validation import Content
+from fitting.studies.fit.assess import assess_solution, search_with_noise
+from fitting.studies.fit.fit import Fit, FittedParameter, Interval
+from fitting.studies.sample.sample import sample_around, with_open_noise
+
+DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
+LEVELS = (0.5, 0.8, 0.95)  # of a posterior's central intervals
+LOG_PROBABILITY = "log-probability"  # ranked beside the parameters
+
+
+class Truth(NamedTuple):
+    """What a replicate is made from."""
+
+    u: Float[np.ndarray, " free"]
+    noise_seed: int
+    seed: int
+    """Of the search and the sampler."""
+
+
+class Outcome(TypedDict):
+    """The fit of a replicate of any kind, as its file holds it."""
+
+    number: int
+    """From 0."""
+    cost: float
+    converged: bool
+    message: str
+    starts: int
+    agreeing: int
+    seconds: float
+    """For the search."""
+    parameters: list[FittedParameter]
+    """As `fit.json` has them."""
+    noise: NotRequired[Annotated[Content, NoiseModel]]
+    """Where the experiment estimates it."""
+
+
+class ReplicateFit(Outcome):
+    """The fit to motion that the experiment's own system makes."""
+
+    truth_u: list[Finite]
+    truth: list[Finite]
+    """In the parameters' units."""
+    truth_levels: list[Finite]
+    """Of the smallest intervals of the profiles that contain the truth, 0..1."""
+    truth_valley_cost: float
+    """Where a descent that begins at the truth ends."""
+
+
+class ReplicateChain(TypedDict):
+    """The posterior of a replicate, as its file holds it."""
+
+    number: int
+    ranks: dict[str, Annotated[int, between(0.0, float(DRAWS))]]
+    """Number of independent draws, of `DRAWS`, below the truth: of each parameter, and of the
+    log-probability."""
+    intervals: dict[str, Annotated[list[Interval], length(len(LEVELS))]]
+    """Of each parameter, in its unit: the central intervals with the `LEVELS`."""
+    draws: int
+    """Independent ones in the chain."""
+    converged: bool
+    message: str
+    seconds: float
+
+
+def draw_truth(problem: Problem[jaxik.FootIK], experiment: Experiment, number: int) -> Truth:
+    """The truth of a replicate, from the prior of the problem."""
+    random = np.random.default_rng([experiment.seed, number])
+    u = problem.space.prior.draw(random, 1)[0]
+    noise_seed, seed = random.integers(2**32, size=2)
+    return Truth(u, int(noise_seed), int(seed))
+
+
+def fit_replicate(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    number: int,
+    progress: Callable[[Progress], None] | None = None,
+    noise_factor: float = 1.0,
+) -> ReplicateFit:
+    """Fits a replicate as `jaxik fit` does, and descends from its truth.
+
+    Args:
+        problem: of the experiment.
+        experiment: its settings of the search, and the seed.
+        number: of the replicate, from 0.
+        progress: called as the search goes on.
+        noise_factor: how much larger the simulated noise is than what the problem assumes.
+
+    Raises:
+        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
+        ValueError: the fit cannot be assessed.
+    """
+    truth = draw_truth(problem, experiment, number)
+    simulated = _simulated(problem, truth, noise_factor)
+    fitted = fit_simulated(simulated, dataclasses.replace(experiment, seed=truth.seed), progress)
+    values = np.asarray(problem.space.values(truth.u))
+    profiles = fitted.identifiability.profiles
+    levels = [
+        level_at(profiles[parameter.name], parameter, value)
+        for parameter, value in zip(problem.space.parameters, values, strict=True)
+    ]
+    settings = experiment.fit.search
+    return {
+        **outcome(number, fitted),
+        "truth_u": truth.u.tolist(),
+        "truth": values.tolist(),
+        "truth_levels": levels,
+        "truth_valley_cost": _polished_cost(fitted.problem.with_weight(1.0), settings, truth.u),
+    }
+
+
+def fit_simulated(
+    simulated: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+) -> Fit:
+    """Fits simulated motion as `jaxik fit` does.
+
+    Args:
+        simulated: the problem of the experiment, with this motion.
+        experiment: its settings of the search, with the seed of the replicate.
+        progress: called as the search goes on.
+
+    Raises:
+        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
+        ValueError: the fit cannot be assessed.
+    """
+    simulated, solution = search_with_noise(simulated, experiment, progress)
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    fitted = assess_solution(experiment, simulated, solution, progress)
+    if fitted.solution.interrupted:
+        raise KeyboardInterrupt
+    return fitted
+
+
+def outcome(number: int, fitted: Fit) -> Outcome:
+    """What the file of a replicate says of its fit; numbers count from 0."""
+    solution = fitted.solution
+    result: Outcome = {
+        "number": number,
+        "cost": solution.cost,
+        "converged": solution.converged,
+        "message": solution.message,
+        "starts": solution.starts,
+        "agreeing": solution.agreeing,
+        "seconds": solution.seconds,
+        "parameters": fitted.parameters,
+    }
+    if fitted.experiment.noise.estimates_any:
+        result["noise"] = dataclasses.asdict(fitted.noise)
+    return result
+
+
+def sample_replicate(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    fitted: ReplicateFit,
+    progress: Callable[[SamplingProgress], None] | None = None,
+    noise_factor: float = 1.0,
+) -> ReplicateChain:
+    """Samples the posterior of a replicate as `jaxik sample` does, around its fit.
+
+    Raises:
+        KeyboardInterrupt: the sampling was interrupted; half a chain counts for nothing.
+        ValueError: walkers cannot start around the fit.
+    """
+    number = fitted["number"]
+    truth = draw_truth(problem, experiment, number)
+    simulated = _simulated(problem, truth, noise_factor)
+    own = dataclasses.replace(experiment, seed=truth.seed)
+    if "noise" in fitted:
+        simulated = with_noise(simulated, NoiseModel(**fitted["noise"]))
+    posterior = sample_around(fitted["parameters"], simulated, own, None, progress)
+    if posterior.interrupted:
+        raise KeyboardInterrupt
+    draws = independent_draws(posterior)
+    random = np.random.default_rng([experiment.seed, number, DRAWS])
+    log_probability = with_open_noise(simulated, own).log_probability(jnp.asarray(truth.u))
+    ranks = rank(np.append(fitted["truth"], log_probability), draws, random)
+    quantities = [*posterior.names, LOG_PROBABILITY]
+    ends = 0.5 + np.multiply.outer(LEVELS, [-0.5, 0.5])
+    intervals = np.quantile(posterior.kept.reshape(-1, len(posterior.names)), ends, axis=0)
+    return {
+        "number": number,
+        "ranks": dict(zip(quantities, ranks.tolist(), strict=True)),
+        "intervals": dict(zip(posterior.names, intervals.transpose(2, 0, 1).tolist(), strict=True)),
+        "draws": len(draws),
+        "converged": posterior.converged,
+        "message": posterior.message,
+        "seconds": posterior.seconds,
+    }
+
+
+def _simulated(
+    problem: Problem[jaxik.FootIK], truth: Truth, noise_factor: float
+) -> Problem[jaxik.FootIK]:
+    """The problem with motion made at a truth; it assumes the same noise as before."""
+    assumed = noise_of(problem)
+    sigmas = {kind: noise_factor * sigma for kind, sigma in assumed.sigmas.items()}
+    noisy = with_noise(problem, dataclasses.replace(assumed, sigmas=sigmas))
+    return with_noise(simulate(noisy, truth.u, truth.noise_seed), assumed)
+
+
+def level_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
+    """Level, 0..1, of the smallest interval of a profile that contains a value."""
+    places = to_fractions(parameter, profile.values)
+    place = to_fractions(parameter, np.asarray(value))
+    rise = float(np.interp(place, places, np.sqrt(np.maximum(profile.rises, 0.0))) ** 2)
+    return level_of(parameter, profile.values, profile.rises, rise)
+
+
+def independent_draws(posterior: Posterior) -> Float[np.ndarray, "draws quantities"]:
+    """Kept steps an autocorrelation time or more apart, all walkers: values, log-probability."""
+    kept = np.delete(posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1)
+    both = np.concatenate([posterior.kept, kept[..., None]], axis=-1)
+    slowest = float(posterior.autocorrelation_time.max()) / posterior.thin_by
+    apart = int(np.ceil(min(slowest, len(both))))  # infinite if nothing moves
+    return both[::-apart].reshape(-1, both.shape[-1])
+
+
+def rank(
+    truth: Float[np.ndarray, " quantities"],
+    draws: Float[np.ndarray, "draws quantities"],
+    random: np.random.Generator,
+) -> Int[np.ndarray, " quantities"]:
+    """Rank of a truth, quantity by quantity, among `DRAWS` of the draws.
+
+    Where there are fewer, their ranks are spread at random over the places that each stands for:
+    uniform ranks stay uniform.
+    """
+    chosen = random.permutation(draws)[:DRAWS]
+    below = np.sum(chosen < truth, axis=0)
+    if len(chosen) == DRAWS:
+        return below
+    places = (below + random.random(truth.size)) / (len(chosen) + 1)
+    return np.floor((DRAWS + 1) * places).astype(int)
+
+
+def _polished_cost(
+    problem: Problem[jaxik.FootIK], settings: SearchSettings, u: Float[np.ndarray, " free"]
+) -> float:
+    """The lowest cost of a descent that begins at the truth."""
+    try:
+        return descent.polish(Search(problem, settings), SearchState.at(u)).best.cost
+    except StepsUsedUp as error:
+        return error.state.best.cost

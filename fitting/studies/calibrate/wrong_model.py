@@ -1,0 +1,498 @@
+"""A replicate under a wrong model: another system makes the motion, and it is captured with errors.
+
+No value of the fitted parameters is true, then. What a fit says of its motion still must be: on
+frames that were held out, against the capture and against the motion that has no errors.
+"""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypedDict, cast
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+import jaxik
+from fitting.clips import contacts, edit
+from fitting.experiment import systems
+from fitting.experiment.experiment import Experiment
+from fitting.inference import sensitivity
+from fitting.inference.optimise.solution import Progress
+from fitting.inference.proportions import Proportion, proportion
+from fitting.motion.goodness import CLOSE, UNSEEN, Distances, Kinds, Motion, Part
+from fitting.problem.problem import Problem
+from fitting.problem.scene import Scene
+from fitting.problem.simulation import displaced, with_motion_of
+from fitting.problem.space import free_parameter, make_space, present_value
+from fitting.runtime.json_files import Finite
+from fitting.runtime.precision import in_float64, with_floats
+from fitting.runtime.validation import Content
+from fitting.studies.fit.fit import Fit
+from fitting.studies.translation import NamedSystem
+from jaxik.world.skeleton import Transform
+
+from .replicates import Outcome, fit_simulated, outcome
+
+SPREAD = 0.3  # of u, in which the truth's parameters are drawn around the values of the system
+
+
+LEVEL = 0.95  # of the bounds of shares
+TRUE_VERDICTS = 0.95  # of all, at least
+POSITIONS = "ankle", "knee", "pelvis"
+WORSE = 0.002  # m rms, further off than the animation
+WORDS = "fits", "does not fit", "worse"
+
+DRIFT_PERIODS = (10.0, 30.0)  # s
+POP_EVERY = 2.0  # s, on average
+POP_FRAMES = 4  # at most
+SWING_SPEED = 0.4  # m/s, of an animated ankle, above which its foot swings
+KNEE_SHARE = 0.5  # of the ankle's deviation in a swing
+
+Series = Float[np.ndarray, "frames ..."]
+
+
+class KindDistances(TypedDict):
+    """Distances of a motion by kind of joint, m and rad."""
+
+    ankle: Finite
+    knee: Finite
+    pelvis: Finite
+    foot: Finite
+
+
+class MotionDistances(TypedDict):
+    """Distances of all motions on the same frames."""
+
+    animation: KindDistances
+    before: KindDistances
+    fitted: KindDistances
+
+
+class PartDistances(TypedDict):
+    """Distances on fitted and on held-out frames, as `Distances` has them."""
+
+    fitted: MotionDistances
+    held_out: MotionDistances
+
+
+class Judgement(TypedDict):
+    """What a fit says of its motion, and what it rests on."""
+
+    fits: bool
+    sentence: str
+    distances: PartDistances
+
+
+class WrongModelFit(Outcome):
+    """The fit to motion that another system has made."""
+
+    truth_values: dict[str, Finite]
+    """Of the parameters of that system, by dotted name."""
+    errors: dict[str, Finite]
+    """Sizes of the capture's errors, as `ErrorSizes` has them."""
+    captured: Judgement
+    """The fit against the capture, as `jaxik fit` reports it."""
+    lasting: Judgement
+    """The same fit against a capture with only the errors that last: no noise and no jumps."""
+    noise_free: Judgement
+    """The same fit against the motion without errors."""
+
+
+@in_float64
+def draw_system(
+    truth: jaxik.FootIK, rig: jaxik.Rig | None, random: np.random.Generator
+) -> tuple[jaxik.FootIK, dict[str, float]]:
+    """A system near the given one, and its parameters by name.
+
+    What is 0 stays 0, and what is at a bound stays there: both mean that something is off. Vectors
+    stay, as they are places on the body, and so does what another parameter stays above.
+
+    Args:
+        truth: the system.
+        rig: whose body its ranges are for; None is the adult.
+        random: what it is drawn from.
+    """
+    table = sensitivity.all_parameters(truth, rig)
+    numbers = [name for name in table if present_value(truth, name) and "[" not in name]
+    parameters = [free_parameter(truth, name, rig, **table[name]) for name in numbers]
+    below = {parameter.above for parameter in parameters}
+    parameters = [parameter for parameter in parameters if parameter.leaf not in below]
+    space = make_space(with_floats(truth, np.float64), parameters)
+    u = np.asarray(space.pack({})) + SPREAD * random.normal(size=space.size)
+    ik = space.unpack(u)
+    return ik, {name: present_value(ik, name) for name in table}
+
+
+def fit_wrong_model(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    truth: jaxik.FootIK,
+    number: int,
+    progress: Callable[[Progress], None] | None = None,
+    noise_factor: float = 1.0,
+) -> WrongModelFit:
+    """Fits the motion of another system, captured with errors, as `jaxik fit` does.
+
+    Args:
+        problem: of the experiment.
+        experiment: its settings of the search, and the seed.
+        truth: the other system, around which the truth of the replicate is drawn.
+        number: of the replicate, from 0.
+        progress: called as the search goes on.
+        noise_factor: how much larger the errors are than usual.
+
+    Raises:
+        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
+        ValueError: the fit cannot be assessed.
+    """
+    random = np.random.default_rng([experiment.seed, number])
+    rig = problem.data[0].rig if experiment.body == "clip" else None
+    ik, values = draw_system(truth, rig, random)
+    masked = [clip.mask_pops for clip in experiment.clips]
+    made, sizes = with_motion_of(problem, ik), draw_sizes(random, noise_factor)
+    lasting_sizes = dataclasses.replace(sizes, pop=0.0, noise=0.0)
+    lasting = with_errors(made, lasting_sizes, masked, copy.deepcopy(random))
+    captured = with_errors(made, sizes, masked, random)
+    own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
+    fitted = fit_simulated(captured, own, progress)
+    return {
+        **outcome(number, fitted),
+        "truth_values": values,
+        "errors": dataclasses.asdict(sizes),
+        "captured": _judged(fitted),
+        "lasting": _judged(_against(fitted, lasting)),
+        "noise_free": _judged(_against(fitted, made)),
+    }
+
+
+def _against(fitted: Fit, made: Problem[jaxik.FootIK]) -> Fit:
+    """A fit as it is judged by other references, on the frames that were seen in its own."""
+    references = [
+        dataclasses.replace(
+            scene.reference,
+            observed=seen.reference.observed,
+            held_out=seen.reference.held_out,
+        )
+        for scene, seen in zip(made.data, fitted.problem.data, strict=True)
+    ]
+    problem = eqx.tree_at(
+        lambda problem: [scene.reference for scene in problem.data], fitted.problem, references
+    )
+    return dataclasses.replace(fitted, problem=problem)
+
+
+def _judged(fitted: Fit) -> Judgement:
+    parts = {
+        part: {motion: dict(kinds) for motion, kinds in motions.items()}
+        for part, motions in fitted.distances.parts.items()
+    }
+    return {
+        "fits": fitted.verdict.fits,
+        "sentence": fitted.verdict.sentence,
+        "distances": cast(PartDistances, parts),
+    }
+
+
+def identity_of(truth: NamedSystem) -> Content:
+    """What the truths of all replicates follow from, as JSON holds it."""
+    leaves = {name: present_value(truth.ik, name) for name in sensitivity.all_parameters(truth.ik)}
+    return {"name": truth.name, "rules": systems.rule_names(truth.ik), "values": leaves}
+
+
+@dataclasses.dataclass(frozen=True)
+class WrongModelAssessment:
+    """What was found, on frames that were held out unless a field says otherwise."""
+
+    replicates: int
+    kept_no_worse: Proportion
+    """How often the kept system is no further from the capture than the flat animation: by the root
+    mean square over ankles, knees and pelvis."""
+    kept_no_worse_anywhere: Proportion
+    """How often no kind of joint is, and the orientation of the feet neither."""
+    kept_no_worse_noise_free: Proportion
+    """The first again, against the motion without errors."""
+    fitted_no_worse: Proportion
+    """The first again, of the fitted system, kept or not."""
+    verdicts: Proportion
+    """How often the verdict is true."""
+    verdicts_of: Mapping[str, Proportion]
+    """The same, by what it says."""
+    coverage_of: Mapping[str, Proportion]
+    """How often the fit's 95 % intervals contain the value of the system that made the motion, by
+    parameter that both have; nothing that they should."""
+    medians: Mapping[str, Mapping[str, float]]
+    """m or rad, of the distances from the motion without errors, by motion and kind of joint."""
+    worse: tuple[int, ...]
+    """Replicates whose kept system is worse than the animation, from 1."""
+    false: tuple[int, ...]
+    """Replicates whose verdict is not true."""
+    unconverged: tuple[int, ...]
+
+    @property
+    def outside(self) -> list[str]:
+        """The checks that failed, in words."""
+        checks = {
+            "the kept system against the animation": self.kept_no_worse.inside,
+            "the share of true verdicts": self.verdicts.inside,
+        }
+        return [words for words, inside in checks.items() if not inside]
+
+    @property
+    def inside(self) -> bool:
+        """Whether all checks passed."""
+        return not self.outside
+
+
+def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
+    """Judges all replicates of a calibration under a wrong model."""
+    captured = [distances_of(fit["captured"]) for fit in fits]
+    noise_free = [distances_of(fit["noise_free"]) for fit in fits]
+    kept: list[Motion] = [distances.better for distances in captured]
+    pairs = list(zip(captured, kept, strict=True))
+    kept_no_worse = np.array([_no_worse(*pair) for pair in pairs])
+    true = np.array([is_true(fit) for fit in fits])
+    words = np.array([word(fit["captured"]) for fit in fits])
+    return WrongModelAssessment(
+        replicates=len(fits),
+        kept_no_worse=_share(kept_no_worse, wanted=(1.0, 1.0)),
+        kept_no_worse_anywhere=_share([_no_worse_anywhere(*pair) for pair in pairs]),
+        kept_no_worse_noise_free=_share(
+            [_no_worse(*pair) for pair in zip(noise_free, kept, strict=True)]
+        ),
+        fitted_no_worse=_share([_no_worse(distances, "fitted") for distances in captured]),
+        verdicts=_share(true, wanted=(TRUE_VERDICTS, 1.0)),
+        verdicts_of={said: _share(true[words == said]) for said in WORDS},
+        coverage_of=_coverage(fits),
+        medians=_medians(noise_free, kept),
+        worse=_numbers(~kept_no_worse),
+        false=_numbers(~true),
+        unconverged=_numbers([not fit["converged"] for fit in fits]),
+    )
+
+
+def word(judgement: Judgement) -> str:
+    """The verdict of a fit, one of `WORDS`."""
+    if judgement["fits"]:
+        return "fits"
+    return "worse" if distances_of(judgement).setbacks else "does not fit"
+
+
+def is_true(fit: WrongModelFit) -> bool:
+    """Whether the motion and its capture, without noise, agree with what a fit says."""
+    noise_free = distances_of(fit["noise_free"])
+    if fit["captured"]["fits"]:
+        return not _is_far(noise_free, 1.0) and not noise_free.setbacks
+    if setbacks := distances_of(fit["captured"]).setbacks:
+        part, kind, _, other, _ = setbacks[0]
+        motions = noise_free.parts[part]
+        return motions["fitted"][kind] > motions[other][kind]
+    return not fit["lasting"]["fits"] or _is_far(distances_of(fit["lasting"]), -1.0)
+
+
+def distances_of(judgement: Judgement) -> Distances:
+    """The distances as they were before a file held them."""
+    return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], judgement["distances"]))
+
+
+def summarise(assessment: WrongModelAssessment) -> dict[str, Any]:
+    """The numbers of an assessment as `calibration.json` holds them."""
+    return {
+        "inside": assessment.inside,
+        "outside": assessment.outside,
+        **dataclasses.asdict(assessment),
+    }
+
+
+def _no_worse(distances: Distances, motion: Motion) -> bool:
+    """Whether the joints of a motion are not visibly further off than the animation's."""
+    motions = distances.parts["held_out"]
+    of_motion, of_animation = (
+        math.sqrt(np.mean([motions[name][kind] ** 2 for kind in POSITIONS]))
+        for name in (motion, "animation")
+    )
+    return of_motion <= of_animation + WORSE
+
+
+def _no_worse_anywhere(distances: Distances, motion: Motion) -> bool:
+    """Whether no kind of joint is visibly further off, and the orientation of the feet neither."""
+    motions = distances.parts["held_out"]
+    return all(
+        motions[motion][kind] <= motions["animation"][kind] + UNSEEN[kind] for kind in UNSEEN
+    )
+
+
+def _is_far(distances: Distances, margin: float) -> bool:
+    """Whether the fitted motion is off by more than looks the same, and so many `UNSEEN`."""
+    return any(
+        motions["fitted"][kind] > CLOSE[kind] + margin * UNSEEN[kind]
+        for motions in distances.parts.values()
+        for kind in CLOSE
+    )
+
+
+def _share(hits: Any, wanted: tuple[float, float] = (0.0, 1.0)) -> Proportion:
+    return proportion(np.asarray(hits, bool)[:, None], level=LEVEL, wanted=wanted)
+
+
+def _coverage(fits: Sequence[WrongModelFit]) -> dict[str, Proportion]:
+    """By parameter that both systems have."""
+    hits: dict[str, list[bool]] = {}
+    for fit in fits:
+        for row in fit["parameters"]:
+            if (truth := fit["truth_values"].get(row["name"])) is not None:
+                low, high = row["interval"]
+                hits.setdefault(row["name"], []).append(low <= truth <= high)
+    return {name: _share(covered) for name, covered in hits.items()}
+
+
+def _medians(distances: Sequence[Distances], kept: Sequence[Motion]) -> dict[str, dict[str, float]]:
+    parts = [each.parts["held_out"] for each in distances]
+    names: list[Motion] = ["animation", "before", "fitted"]
+    motions = {name: [part[name] for part in parts] for name in names}
+    motions |= {"kept": [part[name] for part, name in zip(parts, kept, strict=True)]}  # type: ignore[dict-item]
+    return {
+        name: {kind: float(np.median([each[kind] for each in kinds])) for kind in CLOSE}
+        for name, kinds in motions.items()
+    }
+
+
+def _numbers(where: Any) -> tuple[int, ...]:
+    """Replicates, counted from 1."""
+    return tuple(int(i) + 1 for i in np.flatnonzero(where))
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorSizes:
+    """How large the errors of a capture are."""
+
+    drift: float
+    """m, by which the floor rises and sinks in `DRIFT_PERIODS`."""
+    offset: float
+    """m, standard deviation of each coordinate of a joint's constant offset, which turns with the
+    pelvis."""
+    turn: float
+    """rad, likewise of the constant rotations of pelvis and feet."""
+    pop: float
+    """m, by which a marker jumps, with one or more frames of one joint."""
+    swing: float
+    """m, by which a swinging ankle is off its path in mid-swing, smoothly."""
+    noise: float
+    """m, standard deviation of each coordinate, independent in each frame."""
+
+
+LARGEST = ErrorSizes(drift=0.01, offset=0.01, turn=0.03, pop=0.10, swing=0.03, noise=0.002)
+
+
+def draw_sizes(random: np.random.Generator, factor: float = 1.0) -> ErrorSizes:
+    """Sizes between none and `factor` times the `LARGEST`, all equally likely."""
+    return ErrorSizes(*factor * random.random(6) * dataclasses.astuple(LARGEST))
+
+
+def with_errors(
+    problem: Problem[jaxik.FootIK],
+    sizes: ErrorSizes,
+    mask_pops: Sequence[bool],
+    random: np.random.Generator,
+) -> Problem[jaxik.FootIK]:
+    """The problem with errors in its references.
+
+    Args:
+        problem: whose references have none.
+        sizes: of the errors.
+        mask_pops: of each clip, whether frames in which a joint jumps are left out, as in a fit.
+        random: what they are drawn from.
+    """
+    scenes = tuple(
+        _with_errors(scene, sizes, masked, random)
+        for scene, masked in zip(problem.data, mask_pops, strict=True)
+    )
+    return eqx.tree_at(lambda problem: problem.data, problem, scenes)
+
+
+def _with_errors(
+    scene: Scene, sizes: ErrorSizes, mask_pops: bool, random: np.random.Generator
+) -> Scene:
+    reference, dt = scene.reference, np.asarray(scene.frames.dt)
+    time, count = np.cumsum(dt) - dt[0], len(scene.rig.side)
+    joints = (len(dt), 1 + 2 * count, 3)  # pelvis, knees, ankles
+    deviation = swing_deviation(np.asarray(scene.frames.foot_speed), sizes.swing, random)
+    shift = sizes.noise * random.normal(size=joints) + pops(joints, time, sizes.pop, random)
+    drift = floor_drift(time, sizes.drift, random)
+    shift += drift[:, None, None] * np.asarray(scene.terrain.up_ws)
+    heading = Rotation.from_quat(np.asarray(reference.pelvis.rot), scalar_first=True)
+    for joint, offset in enumerate(sizes.offset * random.normal(size=joints[1:])):
+        shift[:, joint] += heading.apply(offset)
+    shift[:, 1 : 1 + count] += KNEE_SHARE * deviation
+    shift[:, 1 + count :] += deviation
+    turns = sizes.turn * random.normal(size=(1 + count, 3))
+    pelvis = _displaced(reference.pelvis, shift[:, 0], turns[0])
+    knee_ws = np.asarray(reference.knee_ws) + shift[:, 1 : 1 + count]
+    ankle = _displaced(reference.ankle, shift[:, 1 + count :], turns[1:])
+    seen = np.ones(len(dt), bool)
+    if mask_pops:
+        positions = [pelvis.pos[:, None], knee_ws, ankle.pos]
+        seen = ~edit.jumps(np.concatenate(positions, axis=1), float(1 / dt.mean()))
+    captured = dataclasses.replace(
+        reference,
+        pelvis=pelvis,
+        knee_ws=jax.device_put(knee_ws),
+        ankle=ankle,
+        observed=reference.observed & seen,
+        held_out=reference.held_out & seen,
+    )
+    return dataclasses.replace(scene, reference=captured)
+
+
+def floor_drift(time: Series, size: float, random: np.random.Generator) -> Series:
+    """Height, m, (frames,), of a floor that slowly rises and sinks by `size`; time in s."""
+    phase, period = random.uniform(0.0, 2 * np.pi), random.uniform(*DRIFT_PERIODS)
+    return size * np.sin(phase + 2 * np.pi * time / period)
+
+
+def swing_deviation(speed: Series, size: float, random: np.random.Generator) -> Series:
+    """How far each ankle is off its path, m, (frames, legs, 3): smooth, and 0 while a foot stands.
+
+    Each swing has a direction of its own.
+
+    Args:
+        speed: of the animated ankles, m/s, (frames, legs).
+        size: m, in mid-swing.
+        random: what directions are drawn from.
+    """
+    deviation = np.zeros((*speed.shape, 3))
+    for leg, moving in enumerate((speed > SWING_SPEED).T):
+        for first, last in contacts.runs(moving):
+            direction = random.normal(size=3)
+            place = (np.arange(first, last + 1) - first + 1) / (last - first + 2)
+            bump = size * np.sin(np.pi * place) ** 2
+            deviation[first : last + 1, leg] = bump[:, None] * direction / np.linalg.norm(direction)
+    return deviation
+
+
+def pops(
+    shape: tuple[int, int, int], time: Series, size: float, random: np.random.Generator
+) -> Series:
+    """Jumps, m, of single joints for a few frames, as a marker's that is mistaken for another.
+
+    Args:
+        shape: frames, joints, 3.
+        time: s.
+        size: m.
+        random: what they are drawn from.
+    """
+    frames, joints, _ = shape
+    jumps = np.zeros(shape)
+    for _ in range(random.poisson(time[-1] / POP_EVERY)):
+        first, joint = random.integers(frames), random.integers(joints)
+        direction = random.normal(size=3)
+        last = first + random.integers(1, POP_FRAMES + 1)
+        jumps[first:last, joint] = size * direction / np.linalg.norm(direction)
+    return jumps
+
+
+def _displaced(joint: Transform, shift: Series, turn: Float[np.ndarray, "*joints 3"]) -> Transform:
+    return displaced(joint, shift, np.broadcast_to(turn, shift.shape))

@@ -1,0 +1,173 @@
+"""The job that writes parameters for others: as files of ours, the game's record, or settings."""
+
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import fitting
+import jaxik
+from fitting.experiment import originals, parameter_files, record_files
+from fitting.experiment.schema import FILE_KEYS
+from fitting.experiment.systems import Preset
+from fitting.runtime import files
+from fitting.runtime.precision import in_float64
+from fitting.runtime.validation import check_keys, error_context
+from jaxik import record
+
+from .fit import run_folder
+
+OURS = (".toml", ".json", ".csv", ".bin")  # parameters, parameters, record, record
+
+PACKAGE = Path(str(fitting.__file__)).parent
+INSTALLED, REPOSITORY = PACKAGE / "examples", PACKAGE.parent / "data"
+SCHEMA = "experiment.schema.json"  # beside a copied experiment, for editors
+
+
+class Source(NamedTuple):
+    """A system, and what a parameter file says of it besides."""
+
+    ik: jaxik.FootIK
+    preset: Preset
+    leg_length: float | None = None
+    """m, of the body that its numbers are for; None if they fit any body as they are."""
+
+
+@in_float64
+def export(
+    source: str | Path, output: str | Path, *, system: str | None = None, drop: bool = False
+) -> None:
+    """Writes parameters in another form, which the ending of the output chooses.
+
+    Args:
+        source: the folder of a run, a parameter file (.toml, .json), a record (.bin, .csv), or a
+            table of settings (.toml, .json, .csv).
+        output: .toml or .json for parameters, .bin or .csv for the game's record; with a system,
+            .toml, .json or .csv for its settings.
+        system: whose settings are written, under its own names and in its own units: "ozz",
+            "unreal" or "mec". None writes parameters or a record.
+        drop: whether to leave out, with a warning, what a record or the settings cannot hold.
+
+    Raises:
+        ValueError: the source cannot be read, the output has another ending or cannot be written,
+            or cannot hold all parameters and they are not to be left out.
+    """
+    source, output = Path(source), Path(output)
+    suffix = output.suffix.lower()
+    _check_suffix(output, OURS if system is None else originals.SUFFIXES)
+    if system is not None:
+        originals.original_of(system)
+    files.check_output_file(output)
+    loaded = load(source)
+    if system is not None:
+        with error_context(source):
+            values = originals.to_settings(loaded.ik, system, drop=drop)
+            files.write_text(output, originals.settings_text(values, system, suffix))
+    elif suffix == ".toml":
+        files.write_text(output, parameter_files.system_to_toml(*loaded))
+    elif suffix == ".json":
+        files.write_text(output, parameter_files.system_to_json(*loaded))
+    else:
+        units = record.Reading(length_unit="m")
+        content = record_files.from_system(loaded.ik, loaded.preset, source, units, drop=drop)
+        if suffix == ".csv":
+            files.write_text(output, record.to_csv([content]))
+        else:
+            files.write(output, lambda path: path.write_bytes(record.to_bytes(content)))
+
+
+def load(source: Path) -> Source:
+    """The system in a run, a parameter file, a record or a table of settings.
+
+    Raises:
+        ValueError: there is none, or it cannot be read.
+    """
+    if source.is_dir():
+        run_folder.load_fitted_system(source)  # says what is wrong with a run
+        return _load_parameters(source / run_folder.PARAMETERS)
+    if originals.has_settings(source):
+        ik, name = originals.load_settings(source)
+        return Source(ik, originals.ORIGINALS[name].preset)
+    if source.suffix.lower() in (".toml", ".json"):
+        return _load_parameters(source)
+    (only, *more) = record_files.read(source, record.Reading(), None, drop=False)
+    if more:
+        raise ValueError(f"{source} has {1 + len(more)} rows; give a file with one record")
+    with error_context(source):
+        return Source(record.to_ik(only), Preset("record", faithful=True))
+
+
+def _load_parameters(path: Path) -> Source:
+    ik, preset = parameter_files.load_system(path)
+    return Source(ik, preset, parameter_files.leg_length_of(path))
+
+
+def _check_suffix(output: Path, suffixes: Sequence[str]) -> None:
+    if output.suffix.lower() not in suffixes:
+        raise ValueError(f"{output}: wanted a name that ends in one of {list(suffixes)}")
+
+
+def names() -> dict[str, str]:
+    """The names of the experiments whose files are all there, with their titles."""
+    folder = _folder()
+    titles = {}
+    for path in sorted((folder / "experiments").rglob("*.toml")):
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        if all(source.is_file() for source in _sources(path, content).values()):
+            name = path.relative_to(folder / "experiments").with_suffix("").as_posix()
+            titles[name] = content["name"]
+    return titles
+
+
+def path_of(name: str) -> Path:
+    """The file of an experiment, where it is installed.
+
+    Raises:
+        ValueError: there is no such experiment.
+    """
+    check_keys({name: None}, list(names()), "jaxik example")
+    return _folder() / "experiments" / f"{name}.toml"
+
+
+def copy(name: str, folder: Path, schema: str) -> Path:
+    """Copies an experiment, its clips and its terrain into a folder, which is made if missing.
+
+    Args:
+        name: of the experiment.
+        folder: where they go; files that are there already stay as they are.
+        schema: of experiment files, as JSON; the copy names it for editors.
+
+    Returns:
+        The path of the copied experiment.
+
+    Raises:
+        ValueError: there is no such experiment, or a file of it is already there.
+        OSError: the folder cannot be made.
+    """
+    path = path_of(name)
+    text = path.read_text(encoding="utf-8")
+    sources = _sources(path, tomllib.loads(text))
+    copies = {folder / path.name: b"", folder / SCHEMA: schema.encode()}
+    for relative, source in sources.items():
+        target = Path(source.parent.name, source.name)
+        text = text.replace(f'"{relative}"', f'"{target.as_posix()}"')
+        copies[folder / target] = source.read_bytes()
+    copies[folder / path.name] = f"#:schema {SCHEMA}\n{text}".encode()
+    if present := [str(target) for target in copies if target.exists()]:
+        raise ValueError(f"{present[0]} is already there; give an empty folder with -o")
+    for target, content in copies.items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        files.write(target, lambda temporary, content=content: temporary.write_bytes(content))
+    return folder / path.name
+
+
+def _folder() -> Path:
+    """Where experiments, clips and terrains are."""
+    return INSTALLED if INSTALLED.is_dir() else REPOSITORY
+
+
+def _sources(path: Path, content: dict) -> dict[str, Path]:
+    """The files that an experiment names, by how it writes their paths."""
+    relative = [clip[key] for clip in content["clips"] for key in FILE_KEYS if key in clip]
+    return {name: Path(os.path.normpath(path.parent / name)) for name in relative}

@@ -1,0 +1,159 @@
+"""The search of an experiment, and the assessment of its solution, which may meet a lower point."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+import jaxik
+from fitting.experiment.experiment import Experiment
+from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.noise import counted, fit_with_noise
+from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.search import find_best_fit, refine
+from fitting.inference.optimise.solution import Progress, Solution
+from fitting.motion import playback
+from fitting.problem.capture_system import system_and_scenes
+from fitting.problem.problem import Problem
+from fitting.problem.scene import MEASURED
+from fitting.runtime import activity
+
+from .fit import Fit
+
+MAX_RETURNS = 3  # to the search from lower points
+MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
+
+
+def search(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    first: Float[np.ndarray, " free"] | None = None,
+    kept: KeptStages | None = None,
+) -> Solution:
+    """The best fit, without any estimate of how certain it is.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of the search.
+        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
+        first: the u from which the first descent begins; None is the experiment's.
+        kept: the stages of a search that was killed, which goes on after them.
+    """
+    return find_best_fit(
+        problem.with_weight(1.0),
+        experiment.fit.search,
+        starts=experiment.fit.starts,
+        first=first,
+        seed=experiment.seed,
+        progress=progress,
+        kept=kept,
+    )
+
+
+def search_with_noise(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
+) -> tuple[Problem[jaxik.FootIK], Solution]:
+    """The best fit with the noise that the experiment estimates, and the problem with this noise.
+
+    Unless the experiment asks for noise that moves the best point, it only gets a weight.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of noise and search.
+        progress: as for `search`.
+        kept: as for `search`.
+    """
+    solution = search(problem, experiment, progress, kept=kept)
+    settings, noise = experiment.fit.search, experiment.noise
+    problem, solution = fit_with_noise(problem, noise, solution, settings, progress, kept)
+    return weighted(problem, experiment, solution), solution
+
+
+def weighted(
+    problem: Problem[jaxik.FootIK], experiment: Experiment, solution: Solution
+) -> Problem[jaxik.FootIK]:
+    """The problem with the weight by which the residuals at its solution count for intervals."""
+    if experiment.noise.correlation != "counted" or experiment.independent_every:
+        return problem
+    with activity.announced("Weighing the residuals"):
+        return counted(problem, solution.u, played_errors(problem, solution.u))
+
+
+def played_errors(
+    problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"]
+) -> list[dict[str, Float[np.ndarray, "frames ..."]]]:
+    """Errors of each measured kind, clip by clip, by programs that a report needs, too."""
+    played = playback.play_all(*system_and_scenes(problem, u))
+    return [{kind: np.asarray(play.errors[kind]) for kind in MEASURED} for play in played]
+
+
+def assess_solution(
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    solution: Solution,
+    progress: Callable[[Progress], None] | None = None,
+    on_solution: Callable[[Solution], object] = lambda solution: None,
+    kept: KeptStages | None = None,
+) -> Fit:
+    """The fit: a solution and how certain it is, or the lower one that its profiles led to.
+
+    Args:
+        experiment: its settings of the search.
+        problem: the problem of the experiment.
+        solution: of the problem.
+        progress: called as a search goes on.
+        on_solution: called with each solution before its assessment, which may fail.
+        kept: the stages of searches and profiles that were killed.
+
+    Raises:
+        ValueError: if the Jacobian at a solution is not finite.
+    """
+    left: list[float] = []
+    while True:
+        on_solution(solution)
+        of_weight = solution.weighted(float(problem.weight))
+        identifiability = assess_identifiability(problem, of_weight, kept)
+        found_lower = identifiability.improvement > MIN_IMPROVEMENT
+        fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
+        if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
+            return fit
+        first = identifiability.best_u
+        lower = _search_lower(problem, experiment, solution, first, progress, kept)
+        if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
+            unmoved = dataclasses.replace(solution, interrupted=lower.interrupted)
+            return dataclasses.replace(fit, solution=unmoved)
+        left.append(solution.cost)
+        solution = lower
+        problem = weighted(problem, experiment, solution)
+
+
+def _search_lower(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    before: Solution,
+    lower_u: Float[np.ndarray, " free"],
+    progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
+) -> Solution:
+    """The best fit from a point that is lower than a solution; steps and time add to its own.
+
+    Where it is lower than the starts' agreement allows, the search begins anew there.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of the search.
+        before: the solution that is left.
+        lower_u: the lower point, in u.
+        progress: called as the search goes on.
+        kept: the stages of searches that were killed.
+    """
+    settings = experiment.fit.search
+    after = refine(problem.with_weight(1.0), before, lower_u, settings, progress, kept)
+    if after.interrupted or before.cost - after.cost <= settings.agreement:
+        return after
+    return search(problem, experiment, progress, after.u, kept).following(after)

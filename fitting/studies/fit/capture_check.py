@@ -1,0 +1,282 @@
+"""What clips can and cannot tell of foot IK, and how good their data are: said before any solving.
+
+NumPy on the clips as they are loaded; nothing is compiled. Lengths are for an adult.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+
+from fitting.clips import contacts
+from fitting.clips.contacts import runs
+from fitting.experiment.problems import ClipData
+from fitting.ground import meshes
+from fitting.ground.coverage import FLAT, relief
+from fitting.motion import measures
+from fitting.motion.measures import with_soles_of
+from fitting.motion.playback import Playback
+from jaxik.world import body
+
+STEP = 0.10  # m: what a capture should climb
+ON_FLAT_GROUND = (
+    "the ground under all stances is flat (they differ by {:.0f} cm in height): this capture only "
+    "tells that foot IK must leave the feet alone; to learn the rest, record the walk over steps "
+    f"of {100 * STEP:.0f} cm or more"
+)
+MAX_GAP = 0.25  # s without a whole body, which no stance can be judged across
+MAX_MISSING = 0.05  # of the frames
+MAX_DRIFT = 0.015  # m of the floor along a clip
+TREND = 3.0  # standard errors from which on a drift is one
+MAX_SLIDE = 0.03  # m between the first and the last third of a stance
+MIN_RATE = 25.0  # Hz: below it a foot moves by 15 cm and more from frame to frame
+FEW_STANCES = 6  # of all feet
+
+VISIBLE = 0.015  # m, from which an offset is named
+CLEAR = 2.0  # times its scatter
+FEWEST_STANCES = 4  # stances for a height
+FEWEST_FOR_TILT = 8
+EXPLAINED = 0.8  # of the variance of heights between stances, by a tilt
+
+LONGEST = 0.2  # s, that is looked for
+SHORTEST = 0.01  # s, and half a frame, from which a lag is named
+BETTER = 0.8  # of the rms distance of ankles: what is left of it without the lag
+FEWEST_FRAMES = 10  # frames that are compared
+
+
+class Stances(NamedTuple):
+    """The stances of a clip, of all feet."""
+
+    frame: Int[np.ndarray, " stances"]
+    """In the middle."""
+    place: Float[np.ndarray, "stances 2"]
+    """m, of the ball in the ground plane."""
+    ground: Float[np.ndarray, " stances"]
+    """m, height of the ground under the ball; NaN where there is none."""
+    sole: Float[np.ndarray, " stances"]
+    """m, height of the sole there, by the rig."""
+    slide: Float[np.ndarray, " stances"]
+    """m, horizontal way of the ball from the first to the last third."""
+
+
+@dataclass(frozen=True)
+class CaptureCheck:
+    """What there is to say of the clips of an experiment."""
+
+    lines: tuple[str, ...]
+    """A sentence each."""
+    flat: bool
+    """Whether the ground is flat under all stances of all clips."""
+
+
+def check(clips: Sequence[ClipData]) -> CaptureCheck:
+    """What clips can tell, and how good their data are."""
+    each = [stances_of(clip) for clip in clips]
+    reliefs = [
+        relief(*_known(stances)) / body.ratio(clip.reference.rig)
+        for clip, stances in zip(clips, each, strict=True)
+    ]
+    flat = bool(reliefs) and max(reliefs) < FLAT
+    lines = [ON_FLAT_GROUND.format(100 * max(reliefs))] if flat else []
+    for clip, stances in zip(clips, each, strict=True):
+        source = f"{clip.reference.source}: " if len(clips) > 1 else ""
+        lines += [source + line for line in _quality(clip, stances)]
+    return CaptureCheck(tuple(lines), flat)
+
+
+def stances_of(data: ClipData) -> Stances:
+    """The stances of a clip over its ground; none where no foot stands."""
+    clip, height_under = data.reference, meshes.height_function(data.terrain)
+    standing, balls = clip.observed_stances(), clip.joints_ws(3)
+    places = [
+        (first, last, leg)
+        for leg in range(standing.shape[1])
+        for first, last in contacts.runs(standing[:, leg])
+    ]
+    first, last, legs = np.array(places, int).reshape(-1, 3).T
+    frames, third = (first + last) // 2, (last - first) // 3
+    points = balls[frames, legs]
+    way = balls[last - third, legs] - balls[first + third, legs]
+    return Stances(
+        frames,
+        points[:, [0, 2]],
+        height_under(points) if len(points) else np.zeros(0),
+        points[:, 1] - np.asarray(clip.rig.ball_height)[legs],
+        np.linalg.norm(way[:, [0, 2]], axis=-1),
+    )
+
+
+def _quality(data: ClipData, stances: Stances) -> Iterator[str]:
+    """What is wrong with the data of a clip, a sentence each."""
+    clip = data.reference
+    size = body.ratio(clip.rig)
+    if clip.fps < MIN_RATE:
+        yield f"{clip.fps:g} Hz is too slow for feet; wanted {MIN_RATE:g} Hz or more"
+    if gaps := contacts.runs(~clip.observed):
+        share = float(np.mean(~clip.observed))
+        longest = max(last - first + 1 for first, last in gaps) / clip.fps
+        if share > MAX_MISSING or longest > MAX_GAP:
+            yield f"{share:.0%} of the frames were not observed, up to {longest:.2f} s on end"
+    count = len(stances.frame)
+    if count < FEW_STANCES:
+        yield f"feet stand {count} times; so few steps determine little: take a longer clip"
+    if count and (slide := float(np.median(stances.slide))) > MAX_SLIDE * size:
+        yield f"standing feet slide by {100 * slide:.1f} cm in a stance (median)"
+    drift, error = _trend(stances.frame, stances.sole - stances.ground)
+    drift, error = drift * clip.frame_count, error * clip.frame_count
+    if abs(drift) > max(MAX_DRIFT * size, TREND * error):
+        way = "rises" if drift > 0 else "sinks"
+        yield (
+            f"the floor drifts: from the first stance to the last the soles' height above the "
+            f"ground {way} by {100 * abs(drift):.1f} cm; is the terrain that of this capture?"
+        )
+
+
+def _known(stances: Stances) -> tuple[np.ndarray, np.ndarray]:
+    """Places and heights of the ground, where there is some."""
+    known = ~np.isnan(stances.ground)
+    return stances.place[known], stances.ground[known]
+
+
+def _trend(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope of a line through points, and its standard error; 0 of too few."""
+    known = ~np.isnan(y)
+    x, y = x[known].astype(float), y[known]
+    if len(x) < 4 or not np.ptp(x) > 0:
+        return 0.0, np.inf
+    centred = x - x.mean()
+    slope = float(centred @ y / (centred @ centred))
+    rest = y - y.mean() - slope * centred
+    return slope, float(np.sqrt(rest @ rest / (len(x) - 2) / (centred @ centred)))
+
+
+@dataclass(frozen=True)
+class GroundOffset:
+    """How far over its ground a capture stands; a tilt of 0 is none that is clear."""
+
+    height: float
+    """m, of standing soles above the ground, median of the stances; 0 where it is not clear."""
+    scatter: float
+    """m, standard deviation between stances, from their median."""
+    stances: int
+    tilt_x: float = 0.0
+    """rad, by which soles rise over the ground along x."""
+    tilt_z: float = 0.0
+
+
+def measure_ground(
+    gap: Float64[np.ndarray, "frames legs"],
+    places: Float64[np.ndarray, "frames legs 2"],
+    stance: Bool[np.ndarray, "frames legs"],
+) -> GroundOffset:
+    """The offset of a capture from its ground.
+
+    Args:
+        gap: m, of the lower point of each sole over the ground; NaN where there is none.
+        places: m, x and z of the soles.
+        stance: where a foot stands.
+    """
+    heights, where = _of_stances(gap, places, stance)
+    if len(heights) < FEWEST_STANCES:
+        return GroundOffset(0.0, float("nan"), len(heights))
+    tilts = _tilts(heights, where)
+    level = heights - (where - where.mean(axis=0)) @ np.tan(tilts)
+    height = float(np.median(level))
+    scatter = 1.4826 * float(np.median(np.abs(level - height)))
+    is_clear = abs(height) > max(VISIBLE, CLEAR * scatter)
+    return GroundOffset(height if is_clear else 0.0, scatter, len(heights), *map(float, tilts))
+
+
+def _of_stances(
+    gap: np.ndarray, places: np.ndarray, stance: np.ndarray
+) -> tuple[Float64[np.ndarray, " stances"], Float64[np.ndarray, "stances 2"]]:
+    """Median height over the ground of each stance, m, and its place."""
+    heights, where = [], []
+    for leg in range(gap.shape[1]):
+        for first, last in runs(stance[:, leg] & np.isfinite(gap[:, leg])):
+            heights.append(np.median(gap[first : last + 1, leg]))
+            where.append(np.median(places[first : last + 1, leg], axis=0))
+    return np.array(heights), np.array(where).reshape(-1, 2)
+
+
+def _tilts(heights: np.ndarray, where: np.ndarray) -> Float64[np.ndarray, "2"]:
+    """The angles along x and z of the plane through stances, rad; 0 unless it is clear."""
+    none = np.zeros(2)
+    if len(heights) < FEWEST_FOR_TILT:
+        return none
+    offsets, centred = where - where.mean(axis=0), heights - heights.mean()
+    slopes = np.linalg.lstsq(offsets, centred, rcond=0.1)[0]  # across a straight way: none
+    rises = offsets @ slopes
+    left = float(np.sum((centred - rises) ** 2))
+    is_large = np.ptp(rises) > 2 * VISIBLE
+    is_clear = left < (1 - EXPLAINED) * float(np.sum(centred**2))
+    return np.arctan(slopes) if is_large and is_clear else none
+
+
+class CaptureSigns(NamedTuple):
+    """What one clip shows."""
+
+    ground: GroundOffset
+    """Of the captured soles from the ground, as its file has it."""
+    lag: float
+    """s, by which the capture is later than the fitted motion; 0 where that is not clear."""
+
+
+def find(clips: Sequence[ClipData], playbacks: Sequence[Playback]) -> list[CaptureSigns]:
+    """The signs of each clip.
+
+    Args:
+        clips: with whole skeletons; without them nothing is looked for.
+        playbacks: of the same clips, with the fitted system.
+    """
+    return [
+        CaptureSigns(_of_ground(clip), measure_lag(play))
+        for clip, play in zip(clips, playbacks, strict=False)
+    ]
+
+
+def _of_ground(clip: ClipData) -> GroundOffset:
+    captured = with_soles_of(clip.reference, clip.base)
+    feet = measures.soles(captured, clip.base, clip.terrain)
+    places = measures.sole_points(captured).mean(axis=2)[..., [0, 2]]
+    return measure_ground(feet.gap, places, clip.reference.stance_labels())
+
+
+def measure_lag(clip: Playback) -> float:
+    """How long after the fitted motion the capture shows the same, s; 0 unless that is clear.
+
+    Args:
+        clip: with the fitted system.
+    """
+    dt, frames = float(clip.dt[-1]), len(clip.dt)
+    reach = min(round(LONGEST / dt), (frames - FEWEST_FRAMES) // 2)
+    if reach < 1:
+        return 0.0
+    steps = range(-reach, reach + 1)
+    squares = np.array([_mean_square(clip, step, reach) for step in steps])
+    if not np.all(np.isfinite(squares)):
+        return 0.0
+    best = int(np.argmin(squares))
+    if best in (0, len(steps) - 1):  # no minimum within reach
+        return 0.0
+    before, here, after = squares[best - 1 : best + 2]
+    curvature = before - 2 * here + after
+    between = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+    lag = (steps[best] + between) * dt
+    least = here - 0.25 * (before - after) * between
+    is_clear = least < BETTER**2 * squares[reach]
+    return float(lag) if is_clear and abs(lag) >= max(SHORTEST, 0.5 * dt) else 0.0
+
+
+def _mean_square(clip: Playback, step: int, reach: int) -> float:
+    """Mean square of the distance of ankles, less a constant one, with a shift of some frames."""
+    middle = slice(reach, len(clip.dt) - reach)
+    shifted = slice(reach - step, len(clip.dt) - reach - step)
+    captured, fitted = np.asarray(clip.captured.ankle), np.asarray(clip.after.ankle)
+    compared = np.asarray(clip.seen | clip.held_out)[middle]
+    errors = (fitted[shifted] - captured[middle])[compared][:, np.asarray(clip.present) > 0]
+    if len(errors) < FEWEST_FRAMES:
+        return float("nan")
+    return float(np.mean((errors - errors.mean(axis=0)) ** 2))

@@ -1,0 +1,119 @@
+"""Tables and interval plots of a fit's page."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
+
+from fitting.motion.accuracy import Accuracy
+from fitting.motion.measures import Placement
+from fitting.motion.playback import ClipActivity
+from fitting.report.formatting import ACCURACY, Table, headings, interval, number
+from fitting.studies.animations import placement_report
+
+from . import fit_tables
+from .fit import FittedParameter
+from .fit_tables import Truth, verdict
+
+NO_CORRECTION = ("bone_length",)  # figures that say nothing of how close two motions are
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A parameter as the page shows it; fractions say how far up its range, on its scale."""
+
+    name: str
+    meaning: str
+    value: str
+    unit: str
+    interval: str
+    range: str
+    verdict: str
+    determined: bool
+    at: float
+    low: float
+    high: float
+    before: float | None
+    truth: float | None
+    description: str
+    """Of the interval plot, for those who do not see it."""
+
+
+def parameter_rows(
+    rows: Sequence[FittedParameter],
+    scales: Mapping[str, str],
+    docs: Mapping[str, str],
+    truth: Truth,
+) -> list[ParameterRow]:
+    """The free parameters.
+
+    Args:
+        rows: their numbers.
+        scales: by name, on which the range is drawn; all but `log` are linear.
+        docs: by name, what they mean.
+        truth: known values, by name.
+    """
+    return [_parameter_row(row, scales[row["name"]], docs[row["name"]], truth) for row in rows]
+
+
+def _parameter_row(row: FittedParameter, scale: str, doc: str, truth: Truth) -> ParameterRow:
+    low, high = row["low"], row["high"]
+
+    def fraction(value: float) -> float:
+        value = min(max(value, low), high)
+        if scale == "log" and low > 0:
+            return math.log(value / low) / math.log(high / low)
+        return (value - low) / (high - low)
+
+    true = None if truth is None else truth.get(row["name"])
+    unit = "" if row["unit"] == "1" else row["unit"]
+    words = verdict(row)
+    if row["at_bound"]:
+        words += f", at its {'lower' if row['at_bound'] == 'low' else 'upper'} bound"
+    return ParameterRow(
+        name=row["name"],
+        meaning=doc,
+        value=number(row["value"]),
+        unit=unit,
+        interval=interval(*row["interval"]),
+        range=interval(low, high),
+        verdict=words,
+        determined=row["determined"],
+        at=fraction(row["value"]),
+        low=fraction(row["interval"][0]),
+        high=fraction(row["interval"][1]),
+        before=fraction(row["before"]) if math.isfinite(row["before"]) else None,
+        truth=None if true is None else fraction(true),
+        description=(
+            f"{row['name']}: {number(row['value'])} {unit}, 95 % interval "
+            f"{interval(*row['interval'])}, in the range {interval(low, high)}"
+            + ("" if true is None else f", true value {number(true)}")
+        ),
+    )
+
+
+def limit_table(clips: Sequence[ClipActivity]) -> tuple[Table, list[str]]:
+    """How often limits act, and the names of those that never do."""
+    table = fit_tables.limit_table(clips)
+    idle = [name for name in clips[0].limits if not any(clip.limits[name] for clip in clips)]
+    return [row for row in table if row[0] not in idle], idle
+
+
+def accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
+    """How far motions are from the captured one; a column for each, by name."""
+    table = [["difference from the captured motion", *accuracies]]
+    values = zip(*map(astuple, accuracies.values()), strict=True)
+    rows = zip(ACCURACY.items(), headings(ACCURACY), values, strict=True)
+    for (key, column), heading, row in rows:
+        if key not in NO_CORRECTION:
+            table.append([heading, *map(column.format, row)])
+    return table
+
+
+def placement_table(placements: Mapping[str, Placement]) -> Table:
+    """How the feet of motions are placed on the ground; a column for each, by name."""
+    tables = [placement_report.table(placement) for placement in placements.values()]
+    table = [[tables[0][0][0], *placements]]
+    for rows in zip(*(table[1:] for table in tables), strict=True):
+        cells = [" · ".join(filter(None, (share, place))) for _, share, place in rows]
+        table.append([rows[0][0], *cells])
+    return table

@@ -1,0 +1,336 @@
+"""Jobs that search: a fit, its posterior, and translations between systems."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import jaxik
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.in_memory import with_files
+from fitting.experiment.problems import ClipData, load_clips, load_known_values, problem_from_clips
+from fitting.experiment.record_files import left_out
+from fitting.inference.noise import NoiseModel, with_noise
+from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.solution import Progress, Solution
+from fitting.inference.sample.posterior import Posterior, SamplingProgress
+from fitting.problem.problem import Problem, digest_with
+from fitting.report import style
+from fitting.report.formatting import joined
+from fitting.runtime.precision import in_float64
+from fitting.studies import translation
+from fitting.studies.output import Loaded, Log, log_output, output_folder, silent, unwatched
+from fitting.studies.sample import posterior_report
+from fitting.studies.sample.replay import replay
+from fitting.studies.sample.sample import SampledFit, minus_cost_at, sample_around, shown_noise
+from fitting.studies.translation import TranslationRequest
+
+from . import capture_check, fit_report, record_price, run_folder
+from .assess import assess_solution, search, search_with_noise
+from .fit import Fit
+from .fit_motions import Rehearsal
+
+INTERRUPTED = "interrupted; assessing and writing the best point so far"
+
+
+class Shown(NamedTuple):
+    """What a fit shows and judges: nothing of it decides what is found."""
+
+    clips: tuple[ClipData, ...]
+    known_values: Mapping[str, float] | None = None
+    """What made a synthetic reference."""
+    has_noise: bool = True
+    """False if the reference is the motion of another system."""
+
+
+@in_float64
+def fit(
+    experiment: Experiment | str | Path,
+    output: str | Path | None = None,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+    log: Log = silent,
+    loaded: Loaded = unwatched,
+    report: bool = True,
+) -> Fit:
+    """Fits the free parameters of an experiment to its clips.
+
+    KeyboardInterrupt (Ctrl-C) ends the search; the best point so far is assessed, written and
+    returned as any other fit, with `solution.interrupted` set. Called again with the same folder,
+    an interrupted or killed fit goes on, to the same result as in one go.
+
+    Args:
+        experiment: an experiment, or the path of its file.
+        output: folder for the run.
+        progress: called as the search goes on.
+        log: called with what the command line prints.
+        loaded: called with the experiment, its problem and clips, before the search.
+        report: whether the folder gets tables, pictures and a page beside the numbers.
+
+    Raises:
+        ValueError: the experiment is wrong or does not fit its clips or its preset, or the folder
+            cannot be made.
+    """
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(experiment)
+    known_values = load_known_values(experiment)
+    with output_folder(output) as run:
+        experiment = with_files(experiment, run)
+        lines: list[str] = []
+        clips = load_clips(experiment, lines.append)
+        problem = problem_from_clips(experiment, clips)
+        what = f"{len(experiment.free) or 'no'} parameters of {experiment.preset}"
+        if of_captures := experiment.free_count - len(experiment.free):
+            what += f" and {of_captures} of the capture"
+        heading = f"fitting {what} to {len(clips)} clip(s)"
+        log("\n".join([heading, *lines, *capture_check.check(clips).lines]))
+        loaded(experiment, problem, clips)
+        kept = kept_stages(run, experiment, problem, log)
+        rehearsal = Rehearsal(problem) if run is not None and report else None
+
+        def watch(reached: Progress) -> None:
+            if rehearsal is not None:
+                rehearsal.start()  # not before: until now, programs of the search were compiled
+            if progress is not None:
+                progress(reached)
+
+        problem, solution = search_with_noise(problem, experiment, watch, kept)
+        if solution.interrupted:
+            log(INTERRUPTED)
+        shown = Shown(clips, known_values)
+        if run is not None and report:
+            style.prepare_saving()
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
+        texts, sections = _price_of_record(fitted, progress, log)
+        if run is not None and report:
+            fit_report.write_fit(run, fitted, sections, rehearsal=rehearsal)
+        remove(kept, fitted)
+        log(joined(["", fit_report.fit_text(fitted), *texts]))
+        log_output(log, run, run_folder.SUMMARY)
+        return fitted
+
+
+@in_float64
+def sample(
+    fitted: Fit | str | Path,
+    *,
+    max_steps: int | None = None,
+    progress: Callable[[SamplingProgress], None] | None = None,
+    log: Log = silent,
+) -> Posterior:
+    """Samples the posterior around a fit; a fit with a folder has its chain and report there.
+
+    A chain that is there is continued. KeyboardInterrupt (Ctrl-C) ends the sampling; the chain so
+    far is summarised, written and returned with `interrupted` set. Where a chain meets a point that
+    is better than the fit of a folder, the fit goes on from there and takes the old one's place.
+
+    Args:
+        fitted: a fit, or the folder of its run.
+        max_steps: limit to the steps of the sampler over all calls, instead of the experiment's.
+        progress: called as the sampling goes on.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: the folder holds no fit, or its experiment does not fit its clips any more.
+    """
+    if isinstance(fitted, Fit):
+        run, experiment, problem = fitted.run, fitted.experiment, fitted.problem
+        parameters, known_values = fitted.summary["parameters"], fitted.known_values
+        clips = fitted.clips
+    else:
+        run = Path(fitted)
+        experiment, summary = run_folder.load_fit(run)
+        parameters, known_values = summary["parameters"], load_known_values(experiment)
+        clips = load_clips(experiment)
+        problem = problem_from_clips(experiment, clips)
+        if "noise" in summary:
+            problem = with_noise(problem, NoiseModel(**summary["noise"]))
+    if max_steps is not None:
+        experiment = experiment.with_max_sample_steps(max_steps)
+    with output_folder(run):
+        chain = None if run is None else run / run_folder.CHAIN
+        posterior = sample_around(parameters, problem, experiment, chain, progress)
+        if posterior.interrupted:
+            log("interrupted; summarising and writing the chain so far")
+        played = None
+        try:
+            if not posterior.interrupted:
+                u = np.array([row["u"] for row in parameters])
+                played = replay(shown_noise(problem, experiment, u), posterior, experiment.seed)
+                posterior = dataclasses.replace(posterior, blocks=played.blocks)
+        except KeyboardInterrupt:
+            posterior = dataclasses.replace(posterior, interrupted=True)
+        sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
+        if run is not None:
+            _save_and_report(run, sampled)
+            if sampled.has_lower_point and not posterior.interrupted:
+                sampled = _adopt_lower_point(run, problem, clips, sampled, log)
+                posterior = sampled.posterior
+        log(joined(["", posterior_report.posterior_text(sampled, run)]))
+        log_output(log, run, run_folder.SUMMARY)
+        return posterior
+
+
+@in_float64
+def translate(
+    request: TranslationRequest,
+    output: str | Path | None = None,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+    log: Log = silent,
+) -> Fit:
+    """Fits the parameters of one system to the motion of another.
+
+    KeyboardInterrupt (Ctrl-C) ends the search, and a second call with the same folder goes on, as
+    in `fit`. The folder is a run: `sample` and `apply` take it.
+
+    Args:
+        request: which system is fitted to which, and on what.
+        output: a new folder for the run, or that of a translation that was killed or interrupted.
+        progress: called as the search goes on.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: as `studies.translation.prepare`, or the folder holds something already.
+    """
+    run = None if output is None else Path(output)
+    if run is not None:
+        translation.check_folder(run)
+    with output_folder(run):
+        prepared = translation.prepare(request, Path() if run is None else run)
+        experiment, problem = prepared.experiment, prepared.problem
+        log(
+            f"fitting {len(experiment.free)} parameters of {request.target.name} to "
+            f"{request.source.name} on {len(prepared.clips)} clip(s)"
+        )
+        start = translation.starting_point(problem)
+        kept = kept_stages(run, experiment, problem, log)
+        solution = search(problem, experiment, progress, start, kept)
+        if solution.interrupted:
+            log(INTERRUPTED)
+        shown = Shown(prepared.clips, has_noise=False)
+        if run is not None:
+            translation.save_source(run, prepared)
+            shown = shown._replace(known_values=load_known_values(experiment))
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
+        differences = translation.differences(fitted)
+        if run is not None:
+            translation.write(run, prepared, fitted, differences)
+        remove(kept, fitted)
+        log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+        log(translation.translation_text(prepared, differences))
+        log_output(log, run, run_folder.SUMMARY)
+        return fitted
+
+
+def _price_of_record(
+    fitted: Fit, progress: Callable[[Progress], None] | None, log: Log
+) -> tuple[list[str], list[str]]:
+    """What it costs to fit only what the record holds: for the terminal, and in Markdown."""
+    experiment = fitted.experiment
+    if not (experiment.record_only and experiment.free):
+        return [], []
+    if (names := left_out(experiment)) and not fitted.solution.interrupted:
+        log(f"what the record costs: a search in which {', '.join(names)} are free, too")
+    try:
+        price = record_price.measure(fitted, progress)
+    except KeyboardInterrupt:  # the fit is finished: its report must be written
+        price = None
+    text = record_price.text(experiment, price)
+    return ["", text], record_price.section(experiment, price)
+
+
+def _save_and_report(run: Path, sampled: SampledFit) -> None:
+    run_folder.save_posterior(run, sampled)
+    posterior_report.write_posterior(run, sampled)
+
+
+def _adopt_lower_point(
+    run: Path,
+    problem: Problem[jaxik.FootIK],
+    clips: tuple[ClipData, ...],
+    sampled: SampledFit,
+    log: Log,
+) -> SampledFit:
+    """The chain with a fit that went on from its best point, which takes the run's old fit's place.
+
+    The old fit stays until the new one is finished; that of a translation stays in any case, and
+    so does a fit that is not better by the chain's own account.
+    """
+    experiment, posterior = sampled.experiment, sampled.posterior
+    if translation.is_translation(run):
+        return sampled
+    log(
+        f"the chain met a point whose cost is {posterior.improvement:.3g} lower than the fit's; "
+        "the fit goes on from there"
+    )
+    try:
+        first = np.asarray(problem.space.pack(posterior.best_values))
+        solution = search(problem, experiment, first=first)
+        at_solution = minus_cost_at(problem, experiment, solution.u)
+        if solution.interrupted or at_solution <= posterior.start_minus_cost:
+            return sampled
+        fitted = assess_solution(experiment, problem, solution)
+    except KeyboardInterrupt:
+        return sampled
+    known_values = sampled.known_values
+    fitted = dataclasses.replace(fitted, known_values=known_values, run=run, clips=clips)
+    at_solution = minus_cost_at(problem, experiment, fitted.solution.u)
+    run_folder.save_solution(run, experiment, problem, fitted.solution)
+    run_folder.save_fit(run, fitted)
+    fit_report.write_fit(run, fitted)
+    log(joined(["", fit_report.fit_text(fitted)]))
+    sampled = dataclasses.replace(
+        sampled,
+        parameters=fitted.summary["parameters"],
+        posterior=dataclasses.replace(posterior, start_minus_cost=at_solution),
+    )
+    _save_and_report(run, sampled)
+    return sampled
+
+
+def _assess_and_save(
+    run: Path | None,
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    solution: Solution,
+    shown: Shown,
+    progress: Callable[[Progress], None] | None,
+    kept: KeptStages | None,
+) -> Fit:
+    """The fit; each of its solutions is on disk before the assessment, which may fail."""
+
+    def save(solution: Solution) -> None:
+        if run is not None:
+            run_folder.save_solution(run, experiment, problem, solution)
+
+    fitted = assess_solution(experiment, problem, solution, progress, save, kept)
+    fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
+    if run is not None:
+        run_folder.save_fit(run, fitted)
+    return fitted
+
+
+def kept_stages(
+    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
+) -> KeptStages | None:
+    """The finished stages of a fit that was killed in this folder, and room for those of this."""
+    if run is None:
+        return None
+    identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
+    kept = KeptStages(run / run_folder.SEARCH, identity, log)
+    if kept.count:
+        stages = f"{kept.count} stages of its search"
+        if kept.profile_count:
+            stages += f" and {kept.profile_count} of its profiles"
+        log(f"a fit that was interrupted here goes on after {stages}")
+    return kept
+
+
+def remove(kept: KeptStages | None, fitted: Fit) -> None:
+    """Removes the stages of a fit that is finished; an interrupted one goes on from them."""
+    if kept is not None and not fitted.solution.interrupted:
+        kept.remove()

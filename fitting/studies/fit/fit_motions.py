@@ -1,0 +1,137 @@
+"""The motions that a fit is about, as whole skeletons on their ground, for the report's page.
+
+The run folder keeps two of them, the flat animation and the fitted motion.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool
+
+import jaxik
+from fitting.clips import Clip
+from fitting.clips.clip_frames import clip_from_result, raised
+from fitting.experiment.problems import ClipData
+from fitting.ground import ground_patch
+from fitting.ground.ground_patch import GroundPatch
+from fitting.motion import accuracy, measures, playback
+from fitting.motion.accuracy import Accuracy, Errors
+from fitting.motion.measures import PlacedMotion, place, with_soles_of
+from fitting.problem.capture_system import system_and_scenes
+from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
+
+from .fit import Fit
+
+
+@dataclass(frozen=True)
+class ClipMotions:
+    """One clip of a fit."""
+
+    animated: PlacedMotion
+    """The flat animation, with its root where foot IK gets it."""
+    before: PlacedMotion
+    """By the system as it was before the fit."""
+    fitted: PlacedMotion
+    captured: PlacedMotion
+    stance: Bool[np.ndarray, "frames legs"]
+    """Where the captured foot stands, by the clip's labels or else by its motion."""
+    ground: GroundPatch
+    errors: dict[str, Errors]
+    """Of `before` and `fitted`, against the captured motion."""
+
+
+@in_float64
+def fitted_clip(data: ClipData, result: jaxik.Result) -> Clip:
+    """A clip as a system leaves it.
+
+    Args:
+        data: the clip, over the frames of the result.
+        result: of the system on this clip.
+    """
+    return clip_from_result(data.base, result, rise=data.root.rise)
+
+
+@in_float64
+def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> ClipMotions:
+    """The motions of one clip, measured on its ground.
+
+    Args:
+        data: the clip.
+        before: what the system made of it before the fit.
+        fitted: what the fitted system makes of it.
+    """
+    animated = raised(data.base, data.root.rise)
+    captured = with_soles_of(data.reference, data.base)
+    solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}
+    placed = {
+        name: _placed(clip, animated, data)
+        for name, clip in {"animated": animated, **solved, "captured": captured}.items()
+    }
+    return ClipMotions(
+        **placed,
+        stance=data.reference.stance_labels(),
+        ground=ground_patch.around_path(data.reference, data.terrain),
+        errors={
+            name: accuracy.clip_errors(clip, data.reference, animated)
+            for name, clip in solved.items()
+        },
+    )
+
+
+def _placed(clip: Clip, animated: Clip, data: ClipData) -> PlacedMotion:
+    feet = measures.soles(clip, data.base, data.terrain)
+    return place(clip, feet, measures.assess(feet, clip, animated))
+
+
+def summarised(motions: Sequence[ClipMotions]) -> dict[str, Accuracy]:
+    """How far the motions `before` and `fitted` are from the captured ones, over all clips."""
+    return {
+        name: accuracy.summarise([clip.errors[name] for clip in motions])
+        for name in ("before", "fitted")
+    }
+
+
+def saved_clips(fitted: Fit) -> dict[str, Clip]:
+    """What the run folder keeps of the motions, by file name; numbered for several clips."""
+    clips: dict[str, Clip] = {}
+    for number, (data, result) in enumerate(zip(fitted.clips, fitted.results, strict=False), 1):
+        ending = f"_{number}.npz" if len(fitted.clips) > 1 else ".npz"
+        clips[f"base{ending}"] = data.base
+        clips[f"fitted{ending}"] = fitted_clip(data, result)
+    return clips
+
+
+class Rehearsal:
+    """Plays the clips of a problem once, from when it is started or its results are wanted."""
+
+    def __init__(self, problem: Problem[jaxik.FootIK]):
+        self._problem = problem
+
+    def start(self) -> None:
+        """Begins to play, unless it has begun."""
+        _ = self._future
+
+    def results(self) -> tuple[jaxik.Result, ...]:
+        """What the system before the fit makes of each clip; waits until it is played."""
+        return self._future.result()
+
+    @cached_property
+    def _future(self) -> Future[tuple[jaxik.Result, ...]]:
+        thread = ThreadPoolExecutor(1)
+        future = thread.submit(_play, self._problem)
+        thread.shutdown(wait=False)
+        return future
+
+
+@in_float64
+def _play(problem: Problem[jaxik.FootIK]) -> tuple[jaxik.Result, ...]:
+    system, scenes = system_and_scenes(problem, problem.space.pack({}))
+    results = playback.run_all(system, scenes)
+    for scene, result in zip(scenes, results, strict=True):
+        playback.play(scene, result)
+    playback.measure(system, scenes, results)
+    return results

@@ -1,0 +1,523 @@
+"""Pictures of a fit; each function draws one figure."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogFormatter
+
+from fitting.inference.optimise.solution import Progress
+from fitting.inference.profiles.profile import Profile
+from fitting.motion import goodness
+from fitting.motion.goodness import autocorrelations, scale_by_median
+from fitting.motion.playback import Motion, Playback
+from fitting.motion.worst_window import WorstWindow
+from fitting.problem.scene import MEASURED
+from fitting.problem.space import FreeParameter, from_fractions, to_fractions
+from fitting.report.formatting import RESIDUALS
+from fitting.report.style import (
+    AFTER,
+    BEFORE,
+    CAPTURED,
+    EARTH,
+    GROUND,
+    LOCKED,
+    SLIDING,
+    STAGES,
+    STANDING,
+    earth,
+    legend,
+    sections,
+    steepest_part,
+    styled,
+    whole_and_part,
+)
+
+RISE = 1e-6  # relative, of the lowest cost: more than rounding
+LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
+SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
+
+SECONDS = 1.0  # of lag, that are shown
+WIDEST = 8.0  # standard deviations; what is beyond is shown there
+
+PER_ROW = 2  # parameters, each with two panels
+HIGHEST = 1e4  # rise shown over the whole range
+LINEAR = 2.0  # rise up to which that axis is linear
+MARGIN = 0.6  # of the interval's width, on either side of it where it is enlarged
+ENLARGED = 6.0  # rise shown there
+
+STANCE_ALPHA = 0.22
+UNSEEN = "#dddddd"
+
+
+@styled
+def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
+    """Heights of ankles and pelvis over time above the ground; whole clip and a part of it."""
+    figure, columns = _whole_and_part(playback, len(legs) + 1, title)
+    ground = 100 * playback.ground_height()
+    for shown in columns:
+        for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
+            _plot_motions(
+                axes, playback, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg])
+            )
+            earth(axes, playback.time, ground[:, leg])
+            axes.set_title(
+                f"{name.capitalize()} ankle, with the ground under it ({playback.label})"
+            )
+        _plot_motions(shown[-1], playback, lambda motion: 100 * playback.height(motion.pelvis))
+        earth(shown[-1], playback.time, ground.mean(axis=1))
+        shown[-1].set_title("Pelvis, with the mean ground under the feet")
+    for axes in columns[0]:
+        axes.set_ylabel("height, cm")
+    legend(figure, *_lines(playback), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
+    return figure
+
+
+@styled
+def side_view(playback: Playback, legs: Sequence[str], title: str) -> Figure:
+    """Legs seen from the side, in the part of the clip that climbs most."""
+    start, end = steepest_part(playback.time, playback.height(playback.captured.pelvis))
+    inside = slice(start, end + 1)
+    travelled = playback.travelled[inside]
+    spacing = max(LEG_SPACING, (np.max(travelled) - np.min(travelled)) / 20)
+    chosen = start + np.unique(np.floor((travelled - travelled[0]) / spacing), return_index=True)[1]
+    tall = np.clip(16.0 * 1.35 / (np.ptp(travelled) + 1.6), 2.2, 6.5)
+    figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
+    figure.suptitle(f"{title}, seen from the right, {_seconds(playback, start, end)}")
+    rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for leg, (axes, name) in enumerate(zip(rows, legs, strict=True)):
+        for colour, motion in _motions(playback):
+            joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)[:, leg]
+            across, height = playback.along(joints)[chosen], playback.height(joints)[chosen]
+            axes.plot(across.T, height.T, color=colour, linewidth=2.0, solid_capstyle="round")
+            axes.plot(across[:, 1:3].T, height[:, 1:3].T, "o", color=colour, markersize=4)
+            pelvis = playback.along(motion.pelvis)[inside], playback.height(motion.pelvis)[inside]
+            axes.plot(*pelvis, color=colour, linewidth=2.6)
+        along = playback.along(playback.ground_ws)[inside, leg]
+        order = np.argsort(along, kind="stable")
+        earth(axes, along[order], playback.ground_height()[inside, leg][order])
+        axes.set_aspect("equal")
+        axes.set_title(
+            f"{name.capitalize()} leg every {100 * spacing:.0f} cm, and the path of the pelvis"
+        )
+        axes.set_ylabel("height, m")
+    rows[-1].set_xlabel("distance travelled, m")
+    ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
+    legend(figure, *_lines(playback), ground)
+    return figure
+
+
+@styled
+def knees(playback: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
+    """Knee angles over time with the fitted limits; whole clip and a part of it."""
+    figure, columns = _whole_and_part(playback, len(legs), title)
+    lines = _lines(playback)
+    for shown in columns:
+        for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
+            _plot_motions(
+                axes, playback, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg])
+            )
+            axes.set_title(f"{name.capitalize()} knee (180° is straight)")
+            low, high = axes.get_ylim()
+            for limit in limits:
+                axes.axhline(np.degrees(limit), **SIGMA)
+            axes.set_ylim(low, max(high, 183.0))
+    for axes in columns[0]:
+        axes.set_ylabel("knee angle, degrees")
+    if limits:
+        lines.append(Line2D([], [], **SIGMA, label="limits"))
+    legend(figure, *lines)
+    return figure
+
+
+@styled
+def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
+    """Errors of each kind over time, and their distribution against the assumed sigma."""
+    kinds = fitted.fitted_kinds
+    figure = Figure(figsize=(17, 3.0 * len(kinds) + 1.8), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
+    for (axes, side), kind in zip(grid, kinds, strict=True):
+        name, unit, factor = RESIDUALS[kind]
+        for playback, colour in ((first, BEFORE), (fitted, AFTER)):
+            size = factor * _size(playback, kind)
+            axes.plot(_times(playback, size), size, color=colour, linewidth=1.2)
+        axes.axhline(factor * float(fitted.sigmas[kind]), **SIGMA)
+        of_legs = "" if kind in ("pelvis", "body") else " (the larger of the legs)"
+        axes.set_title(f"{name}: size of the error{of_legs}")
+        axes.set_ylabel(unit)
+        axes.set_xlim(fitted.time[0], fitted.time[-1])
+        axes.set_ylim(bottom=0)
+        _distribution(side, np.asarray(first.residuals[kind]), np.asarray(fitted.residuals[kind]))
+        side.set_title(f"{name}: distribution of the residuals")
+    grid[-1, 0].set_xlabel("time, s")
+    grid[-1, 1].set_xlabel("residual, in sigmas")
+    legend(
+        figure,
+        Line2D([], [], color=BEFORE, linewidth=3, label="preset parameters"),
+        Line2D([], [], color=AFTER, linewidth=3, label="fitted parameters"),
+        Line2D([], [], **SIGMA, label="assumed sigma; right: normal distribution"),
+    )
+    return figure
+
+
+@styled
+def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
+    """When each foot stands and locks, as lanes; the whole clip and a part of it."""
+    labelled, locking = bool(np.any(playback.stance)), bool(np.any(playback.locked))
+    lanes: list[tuple[str, str, np.ndarray]] = []
+    for leg, name in enumerate(legs):
+        lanes.append((f"{name} contact weight", STANDING, np.asarray(playback.contact)[:, leg]))
+        if locking:
+            lanes.append((f"{name} foot locked", LOCKED, np.asarray(playback.locked)[:, leg]))
+        if labelled:
+            lanes.append(
+                (f"{name} stance, {playback.label}", CAPTURED, np.asarray(playback.stance)[:, leg])
+            )
+    if np.any(playback.slide):
+        lanes.append(("sliding", SLIDING, np.asarray(playback.slide)))
+    parts = sections(playback.time, playback.height(playback.captured.pelvis))
+    tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
+    figure = Figure(figsize=(17, tall), layout="constrained")
+    figure.suptitle(title if locking else f"{title} (no foot ever locks)")
+    rows = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
+    for axes, (start, end) in zip(rows, parts, strict=True):
+        _draw_lanes(axes, playback.time, lanes)
+        axes.set_xlim(playback.time[start], playback.time[end])
+        whole = (start, end) == parts[0]
+        axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(playback, start, end)}")
+        axes.set_xlabel("time, s")
+    released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
+    shown = [
+        (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
+        (locking, Patch(color=LOCKED, label="foot locked")),
+        (locking, released),
+        (labelled, Patch(color=CAPTURED, label=f"stance, {playback.label}")),
+        (bool(np.any(playback.slide)), Patch(color=SLIDING, label="sliding")),
+    ]
+    legend(figure, *(entry for visible, entry in shown if visible))
+    return figure
+
+
+@styled
+def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
+    """Cost of the fit over time, by stage, and the best so far.
+
+    Where the best rises, the noise was estimated anew; costs on both sides do not compare.
+    """
+    figure = Figure(figsize=(13, 6.5), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots()
+    for i, stage in enumerate(dict.fromkeys(step.stage for step in history)):
+        steps = [step for step in history if step.stage == stage and np.isfinite(step.cost)]
+        axes.plot(
+            [step.seconds for step in steps],
+            [step.cost for step in steps],
+            "o",
+            markersize=7,
+            color=STAGES[i % len(STAGES)],
+            label=f"stage: {stage}",
+        )
+    best = [(step.seconds, step.best) for step in history if np.isfinite(step.best)]
+    costs = [cost for _, cost in best]
+    rises = [i for i in range(1, len(best)) if costs[i] > costs[i - 1] * (1 + RISE)]
+    for begin, end in pairwise([0, *rises, len(best)] if best else []):
+        label = None if begin else "best so far"
+        axes.step(*zip(*best[begin:end], strict=True), where="post", color="black", label=label)
+    for i in rises:
+        label = "noise estimated anew: another cost" if i == rises[0] else None
+        axes.axvline(best[i][0], color="black", linestyle=":", label=label)
+    axes.axhline(cost_before, color=BEFORE, linestyle="--", label="preset, before the fit")
+    axes.set_yscale("log")
+    for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
+    axes.set_xlabel("time since the fit began, compilation included, s")
+    axes.set_ylabel("cost: half the sum of squared residuals")
+    legend(figure, *axes.get_legend_handles_labels()[0])
+    return figure
+
+
+def _lines(playback: Playback) -> list[Line2D]:
+    """Legend entries of the three motions."""
+    shown = (
+        (BEFORE, "flat animation, before foot IK"),
+        (AFTER, "after fitted foot IK"),
+        (CAPTURED, playback.label),
+    )
+    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in shown]
+
+
+def _whole_and_part(playback: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
+    figure = Figure(figsize=(17, 3.4 * rows + 1.6), layout="constrained")
+    figure.suptitle(title)
+    return figure, whole_and_part(
+        figure, playback.time, playback.height(playback.captured.pelvis), rows
+    )
+
+
+def _motions(playback: Playback) -> list[tuple[str, Motion]]:
+    """The three motions with their colours, in drawing order."""
+    return [(BEFORE, playback.before), (CAPTURED, playback.captured), (AFTER, playback.after)]
+
+
+def _plot_motions(axes: Axes, playback: Playback, series: Callable[[Motion], np.ndarray]) -> None:
+    """Plots one series of the animation, the captured and the solved motion over time."""
+    for colour, motion in _motions(playback):
+        axes.plot(
+            playback.time, series(motion), color=colour, linewidth=1.2 if colour == BEFORE else 1.7
+        )
+
+
+def _size(playback: Playback, kind: str) -> np.ndarray:
+    """Length of the error of a kind in every frame, the larger of the legs; NaN if not seen."""
+    error = np.abs(np.asarray(playback.errors[kind]))
+    if kind != "contact":
+        error = np.linalg.norm(error, axis=-1)
+    if error.ndim > 1:
+        error = error.max(axis=1)
+    seen = playback.seen if len(error) == len(playback.seen) else playback.seen[1:-1]
+    return np.where(seen, error, np.nan)
+
+
+def _times(playback: Playback, series: np.ndarray) -> np.ndarray:
+    return playback.time if len(series) == len(playback.time) else playback.time[1:-1]
+
+
+def _distribution(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
+    """Histograms of residuals in sigmas with the normal curve; values beyond 5 are shown at 5."""
+    edges = np.linspace(-5.0, 5.0, 41)
+    for residuals, colour, fill in ((first, BEFORE, True), (fitted, AFTER, False)):
+        values = np.clip(residuals[residuals != 0], -5.0, 5.0)  # 0 in frames that were not seen
+        if values.size:
+            density = np.histogram(values, edges, density=True)[0]
+            axes.stairs(density, edges, fill=fill, color=colour, alpha=0.45 if fill else 1.0)
+    curve = np.linspace(-5.0, 5.0, 201)
+    axes.plot(
+        curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black", linewidth=1.4
+    )
+    axes.set_xlim(-5.6, 5.6)
+    axes.set_xticks([-5, -2.5, 0, 2.5, 5], ["≤−5", "−2.5", "0", "2.5", "≥5"])
+    axes.set_ylabel("density")
+
+
+def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np.ndarray]]) -> None:
+    """Series of 0..1 above one another, with a mark where a locked foot is released."""
+    for row, (_, colour, series) in enumerate(reversed(lanes)):
+        axes.fill_between(time, row, row + 0.75 * series, step="post", color=colour, linewidth=0)
+        axes.axhline(row, color="#bbbbbb", linewidth=0.7)
+        if colour == LOCKED:
+            ends = time[1:][np.diff(series) < -0.5]
+            axes.plot(ends, np.full(len(ends), row + 0.4), "v", color="black", markersize=5)
+    axes.set_ylim(-0.05, len(lanes))
+    axes.set_yticks(np.arange(len(lanes)) + 0.4, [name for name, _, _ in reversed(lanes)])
+    axes.tick_params(axis="y", length=0)
+    axes.grid(False, axis="y")
+
+
+def _seconds(playback: Playback, start: int, end: int) -> str:
+    return f"{playback.time[start]:.1f} s to {playback.time[end]:.1f} s"
+
+
+@styled
+def noise(playback: Playback, title: str) -> Figure:
+    """Autocorrelation and distribution of the residuals of each measured kind."""
+    kinds = [kind for kind in playback.fitted_kinds if kind in MEASURED]
+    figure = Figure(figsize=(17, 2.6 * len(kinds) + 1.8), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(max(len(kinds), 1), 2, squeeze=False, width_ratios=[1.6, 1])
+    for (left, right), kind in zip(grid, kinds, strict=False):
+        _, residuals, active = goodness.series(playback, kind)
+        _draw_autocorrelation(left, residuals, active, float(np.median(playback.dt)))
+        left.set_title(f"{RESIDUALS[kind].name}: correlation with later residuals")
+        _draw_tails(right, residuals, active)
+        right.set_title(f"{RESIDUALS[kind].name}: distribution")
+    grid[-1, 0].set_xlabel("seconds later")
+    grid[-1, 1].set_xlabel("residual, in standard deviations (from the median)")
+    legend(
+        figure,
+        Line2D([], [], color=AFTER, linewidth=3, label="residuals of the fit"),
+        Line2D([], [], color=BEFORE, linewidth=3, label="left: 95 % of white noise"),
+        Line2D([], [], color="black", linestyle="--", label="right: normal distribution"),
+    )
+    return figure
+
+
+def _draw_autocorrelation(axes: Axes, residuals: np.ndarray, active: np.ndarray, dt: float) -> None:
+    r, pairs = autocorrelations(residuals, active)
+    shown = min(len(r), max(round(SECONDS / dt), 1))
+    lags = dt * np.arange(1, shown + 1)
+    band = 1.96 / np.sqrt(np.maximum(pairs[:shown], 1))
+    axes.fill_between(lags, -band, band, color=BEFORE, alpha=0.4, linewidth=0)
+    axes.vlines(lags, 0, r[:shown], color=AFTER, linewidth=3)
+    axes.set_xlim(0, lags[-1] + dt)
+    low = min(-0.2, float(np.min(r[:shown], initial=0.0)) - 0.05)
+    axes.set_ylim(low, 1.0)
+
+
+def _draw_tails(axes: Axes, residuals: np.ndarray, active: np.ndarray) -> None:
+    """A histogram over a logarithmic axis, which shows outliers."""
+    edges = np.linspace(-WIDEST, WIDEST, 65)
+    scale = scale_by_median(residuals, active)
+    if scale > 0:
+        values = np.clip(residuals[active] / scale, -WIDEST + 1e-9, WIDEST - 1e-9)
+        density = np.histogram(values, edges, density=True)[0]
+        axes.stairs(density, edges, fill=True, color=AFTER, alpha=0.6)
+    curve = np.linspace(-WIDEST, WIDEST, 321)
+    axes.plot(curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black")
+    axes.set_yscale("log")
+    axes.minorticks_off()  # drawing them takes a quarter of the time of the picture
+    axes.set_ylim(1e-5, 1.0)
+    axes.set_ylabel("density")
+
+
+@styled
+def profiles(
+    parameters: Mapping[str, FreeParameter],
+    curves: Mapping[str, Profile],
+    units: Mapping[str, str],
+    truth: Mapping[str, float] | None,
+    title: str,
+) -> Figure:
+    """Each parameter's profile: on the left over its whole range, on the right its interval.
+
+    Args:
+        parameters: by name.
+        curves: their profiles, by name.
+        units: of the parameters, by name.
+        truth: known values by name.
+        title: of the figure.
+    """
+    lines = -(-len(curves) // PER_ROW)
+    figure = Figure(figsize=(17, 2.35 * lines + 1.6), layout="constrained")
+    figure.suptitle(title)
+    ratios = [1.25, 1.0] * PER_ROW
+    grid = figure.subplots(lines, 2 * PER_ROW, squeeze=False, width_ratios=ratios)
+    panels = grid.reshape(-1, 2)
+    for (whole, part), (name, curve) in zip(panels, curves.items(), strict=False):
+        true = (truth or {}).get(name)
+        for axes in (whole, part):
+            _draw(axes, parameters[name], curve, true)
+        _whole_range(whole, parameters[name])
+        _interval(part, parameters[name], curve)
+        whole.set_title(f"{name}: {curve.verdict}")
+        part.set_xlabel("" if units[name] == "1" else units[name], labelpad=1)
+    for axes in panels[len(curves) :].ravel():
+        axes.set_visible(False)
+    entries = [
+        Line2D([], [], color=AFTER, linewidth=3, label="rise of the lowest cost"),
+        Line2D([], [], color=BEFORE, linestyle="--", label="the prior's part of it"),
+        Patch(color=AFTER, alpha=0.18, label="95 % interval"),
+        Line2D([], [], color="black", linestyle=":", label="rise at its ends"),
+    ]
+    if truth:
+        entries.append(Line2D([], [], color=CAPTURED, linewidth=2.2, label="truth"))
+    legend(figure, *entries, columns=5)
+    return figure
+
+
+def _draw(axes: Axes, parameter: FreeParameter, curve: Profile, true: float | None) -> None:
+    """The curve over fractions of the range, with what belongs to it."""
+    places = to_fractions(parameter, curve.values)
+    axes.plot(places, curve.rises, ".-", color=AFTER, markersize=4)
+    axes.plot(places, curve.prior_rises, "--", color=BEFORE)
+    for valley in curve.valleys:
+        axes.axvspan(
+            *to_fractions(parameter, np.asarray(valley.interval)),
+            color=AFTER, alpha=0.18, linewidth=0,
+        )  # fmt: skip
+    axes.axhline(curve.max_rise, color="black", linestyle=":", linewidth=1.2)
+    if true is not None:
+        axes.axvline(float(to_fractions(parameter, np.asarray(true))), color=CAPTURED)
+
+
+def _whole_range(axes: Axes, parameter: FreeParameter) -> None:
+    axes.set_xlim(0, 1)
+    axes.set_yscale("symlog", linthresh=LINEAR, linscale=0.7)
+    axes.set_ylim(0, HIGHEST)
+    axes.set_yticks([0, 1, 10, 100, 1000, 10000], ["0", "1", "10", "100", "1000", "$10^4$"])
+    axes.tick_params(axis="y", labelsize=10)
+    _label_values(axes, parameter, [0, 0.25, 0.5, 0.75, 1])
+
+
+def _interval(axes: Axes, parameter: FreeParameter, curve: Profile) -> None:
+    low, high = to_fractions(parameter, np.asarray(curve.interval))
+    margin = MARGIN * (high - low)
+    start, end = max(0.0, low - margin), min(1.0, high + margin)
+    axes.set_xlim(start, end)
+    axes.set_ylim(0, ENLARGED)
+    _label_values(axes, parameter, [low, high])
+
+
+def _label_values(axes: Axes, parameter: FreeParameter, places: list[float]) -> None:
+    """Ticks at fractions of the range, labelled with the parameter's values."""
+    values = from_fractions(parameter, np.asarray(places))
+    axes.set_xticks(places, [f"{value:.4g}" for value in values], fontsize=10)
+
+
+@styled
+def worst_window(
+    playback: Playback, legs: Sequence[str], window: WorstWindow, title: str
+) -> Figure:
+    """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
+    inside = slice(window.start, window.end + 1)
+    time = playback.time[inside]
+    rows = 2 * len(legs) + 1
+    figure = Figure(figsize=(17, 3.1 * rows + 1.6), layout="constrained")
+    figure.suptitle(title)
+    panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    ground = 100 * playback.ground_height()[inside]
+
+    def draw(axes: Axes, series: Callable[[Motion], np.ndarray]) -> None:
+        for colour, motion in ((CAPTURED, playback.captured), (AFTER, playback.after)):
+            axes.plot(time, series(motion)[inside], color=colour, linewidth=2.2)
+
+    for leg, name in enumerate(legs):
+        foot, knee = panels[leg], panels[len(legs) + 1 + leg]
+        draw(foot, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg]))
+        earth(foot, time, ground[:, leg])
+        foot.set_title(f"{name.capitalize()} ankle, with the ground under it ({playback.label})")
+        draw(knee, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
+        knee.set_title(f"{name.capitalize()} knee (180° is straight)")
+        knee.set_ylabel("knee angle, degrees")
+        for axes in (foot, knee):
+            stance = np.asarray(playback.stance)[inside, leg] > 0.5
+            _shade(axes, time, stance, color=STANDING, alpha=STANCE_ALPHA)
+    pelvis = panels[len(legs)]
+    draw(pelvis, lambda motion: 100 * playback.height(motion.pelvis))
+    pelvis.set_title("Pelvis")
+    for axes in panels[: len(legs) + 1]:
+        axes.set_ylabel("height, cm")
+    for axes in panels:
+        _shade(axes, time, ~np.asarray(playback.seen)[inside], color=UNSEEN)
+        axes.axvline(playback.time[window.frame], color="black", linestyle=":", linewidth=1.6)
+    panels[-1].set_xlabel("time, s")
+    panels[-1].set_xlim(time[0], time[-1])
+    entries = [
+        Line2D([], [], color=CAPTURED, linewidth=3, label=playback.label),
+        Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
+        Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"),
+        Patch(color=STANDING, alpha=STANCE_ALPHA, label="captured stance"),
+        Line2D([], [], color="black", linestyle=":", label="largest error"),
+    ]
+    if not np.all(np.asarray(playback.seen)[inside]):
+        entries.append(Patch(color=UNSEEN, label="left out of the fit"))
+    legend(figure, *entries, columns=6)
+    return figure
+
+
+def _shade(
+    axes: Axes, time: np.ndarray, mask: np.ndarray, *, color: str, alpha: float = 1.0
+) -> None:
+    """Colours the whole height of the axes where the mask is true."""
+    half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0))
+    for start, end in edges.reshape(-1, 2):
+        axes.axvspan(
+            float(time[start]) - half, float(time[end - 1]) + half,
+            color=color, alpha=alpha, linewidth=0, zorder=0,
+        )  # fmt: skip

@@ -1,0 +1,347 @@
+"""The report of many fits: how many there are, what they found, and which failed."""
+
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+from fitting.experiment.experiment import Experiment
+from fitting.report import pages, style
+from fitting.report.formatting import Table, aligned, bullets, joined, markdown, number, percent
+from fitting.report.pages import Block, Finding, Grid, Points, Section, StudyPage, Text
+from fitting.report.style import AFTER, BEFORE, CAPTURED, styled
+from fitting.runtime import files
+from fitting.studies.fit.sentences import listed
+
+from .many_tasks import FittedValue, ManyFits, ManyProgress, Row
+
+SUMMARY, FIGURE = "summary.md", "fits.png"
+MANY = 50  # rows of a table for people; all are in the file
+SPREAD = (
+    "Of each parameter: the median of the fitted values of all fits that determine it, where 80 % "
+    "of them lie, and how many fits determine it."
+)
+
+COLUMNS = 4
+SHOWN = 15  # parameters
+SHORTEST = 1e-3  # s, of a fit as the histogram shows it
+SINGLE = 150  # fits, up to which each has its interval
+
+TABLES = {"fits.csv": "a row for each fit", "fits.parquet": "the same for pandas and the like"}
+
+
+def plan_line(experiments: int, tasks: int, missing: int, seeds: int) -> str:
+    """What is about to be done."""
+    of = f"{experiments} experiment{'s' * (experiments != 1)}"
+    seed = f", {seeds} seeds for each clip" if seeds > 1 else ""
+    left = "" if missing == tasks else f"; {tasks - missing} are there already"
+    return f"{tasks} fit{'s' * (tasks != 1)} of {of}{seed}{left}"
+
+
+def row_line(row: Row) -> str:
+    """A fit that ended, in one line."""
+    if "outcome" not in row:
+        return f"{row['run']}: FAILED: {row['error']}"
+    outcome = row["outcome"]
+    state = "" if outcome["converged"] else ", not converged"
+    seconds = f", {row['effort']['seconds']:.1f} s" if "effort" in row else ""
+    return f"{row['run']}: cost {number(outcome['cost'])}{seconds}{state}"
+
+
+def progress_line(progress: ManyProgress) -> str:
+    """Rate, time left and failures."""
+    failed = f", {progress.failed} failed" if progress.failed else ""
+    left = progress.remaining
+    time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
+    return f"{progress.rate:.1f} fits a minute, {time_left} left{failed}"
+
+
+def many_text(fits: ManyFits) -> str:
+    """The result, for the terminal."""
+    parts = [bullets(remarks(fits))]
+    if fits.finished:
+        parts.append(aligned(parameter_table(fits)))
+    if fits.failed:
+        parts.append(aligned(failure_table(fits)))
+    return joined(parts, apart=True)
+
+
+def remarks(fits: ManyFits) -> list[str]:
+    """How the fits went, a sentence each."""
+    count, lines = len(fits.finished), []
+    lines.append(f"Finished: {count} of {fits.total} fits.")
+    if fits.interrupted:
+        missing = fits.total - len(fits.rows)
+        rest = "fit that is missing" if missing == 1 else f"{missing} fits that are missing"
+        lines.append(f"Interrupted: the same command makes the {rest}.")
+    if fits.failed:
+        lines.append(f"**Failed**: {len(fits.failed)}; the same command tries them again.")
+    if fits.unconverged:
+        lines.append(f"**Not converged**: {len(fits.unconverged)}.")
+    if bad := misfits(fits):
+        does = "does" if bad == 1 else "do"
+        lines.append(
+            f"{bad} of {count} finished fits {does} not match the motion to within the given "
+            "sigmas, whether converged or not."
+        )
+    if made := [row["effort"] for row in fits.finished if "effort" in row]:
+        seconds = statistics.median(effort["seconds"] for effort in made)
+        cpu = statistics.median(effort["cpu_seconds"] for effort in made)
+        peaks = [effort["peak_mb"] for effort in made if effort["peak_mb"] is not None]
+        memory = f", and at most {max(peaks):.0f} MB in a process" if peaks else ""
+        lines.append(f"A fit took {seconds:.1f} s, {cpu:.1f} s of CPU time (medians){memory}.")
+    return lines
+
+
+def misfits(fits: ManyFits) -> int:
+    """How many finished fits leave more of the motion over than noise of the given sigmas."""
+    return sum(not row["outcome"]["fits"] for row in fits.finished if "outcome" in row)
+
+
+def parameter_table(fits: ManyFits) -> Table:
+    """A row for each parameter of each experiment: where its fitted values lie."""
+    rows = [["experiment", "parameter", "unit", "median", "10 %", "90 %", "determined"]]
+    by_experiment: dict[str, list[Row]] = {}
+    for row in fits.finished:
+        by_experiment.setdefault(row["experiment"], []).append(row)
+    for experiment, members in by_experiment.items():
+        outcomes = [row["outcome"] for row in members if "outcome" in row]
+        for name in dict.fromkeys(name for of in outcomes for name in of["parameters"]):
+            of_name = [of["parameters"][name] for of in outcomes if name in of["parameters"]]
+            values = sorted(fitted["value"] for fitted in of_name if fitted["determined"])
+            figures = [number(q) for q in _quantiles(values)] or ["–"] * 3
+            known = f"{len(values)} of {len(of_name)}"
+            rows.append([experiment, name, of_name[0]["unit"], *figures, known])
+    return rows
+
+
+def _quantiles(values: Sequence[float]) -> list[float]:
+    """The median, and where the middle 80 % end; nothing of nothing."""
+    if not values:
+        return []
+    if len(values) == 1:
+        return [values[0]] * 3
+    tenths = statistics.quantiles(values, n=10, method="inclusive")
+    return [tenths[4], tenths[0], tenths[8]]
+
+
+def failure_table(fits: ManyFits) -> Table:
+    """The fits that failed, each with its error; of very many the first ones."""
+    rows = [["run", "error"]]
+    rows += [[row["run"], row["error"]] for row in fits.failed[:MANY]]
+    if len(fits.failed) > MANY:
+        rows.append(["…", f"and {len(fits.failed) - MANY} others"])
+    return rows
+
+
+def fit_table(fits: ManyFits) -> Table:
+    """A row for each fit; of very many the first ones."""
+    rows = [["run", "state", "cost", "determined", "seconds"]]
+    for row in fits.rows[:MANY]:
+        if "outcome" not in row:
+            rows.append([row["run"], "failed!", "–", "–", "–"])
+            continue
+        outcome = row["outcome"]
+        known = sum(fitted["determined"] for fitted in outcome["parameters"].values())
+        state = "converged" if outcome["converged"] else "not converged!"
+        seconds = f"{row['effort']['seconds']:.1f}" if "effort" in row else "–"
+        count = f"{known} of {len(outcome['parameters'])}"
+        rows.append([row["run"], state, number(outcome["cost"]), count, seconds])
+    if len(fits.rows) > MANY:
+        rows.append([f"and {len(fits.rows) - MANY} others", "", "", "", ""])
+    return rows
+
+
+def share_by_error(fits: ManyFits) -> list[str]:
+    """Errors without what differs from fit to fit, the most frequent first."""
+    counts = Counter(row["error"].rpartition(": ")[2] for row in fits.failed)
+    return [f"{percent(count / fits.total, 0)}: {error}" for error, count in counts.most_common(3)]
+
+
+def write(fits: ManyFits, tables: Sequence[str]) -> None:
+    """Writes summary.md and fits.png into the folder of the fits."""
+    title = f"{fits.total} fits"
+    parts = [f"# {title}", bullets(remarks(fits))]
+    if fits.finished:
+        style.save(fits.folder / FIGURE, overview(fits, title))
+        parts += ["## Parameters", markdown(parameter_table(fits)), SPREAD]
+        parts += [f"![Fitted values and times]({FIGURE})"]
+    if fits.failed:
+        parts += ["## Failed", markdown(failure_table(fits))]
+    parts += ["## Fits", markdown(fit_table(fits)), f"All of them: {', '.join(tables)}."]
+    files.write_text(fits.folder / SUMMARY, "\n\n".join(parts) + "\n")
+
+
+@styled
+def overview(fits: ManyFits, title: str) -> Figure:
+    """Of each parameter the values of all fits; and the seconds that they took.
+
+    Args:
+        fits: with at least one that is finished.
+        title: of the figure.
+    """
+    series = list(_by_parameter(fits.finished).items())[:SHOWN]
+    rows = -(-(len(series) + 1) // COLUMNS)
+    figure = Figure(figsize=(17, 3.6 * rows + 1.0), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+    for axes, ((experiment, name), values) in zip(grid, series, strict=False):
+        _values(axes, values)
+        axes.set_title(f"{name}\n{experiment}", fontsize=12)
+    _seconds(grid[len(series)], fits.finished)
+    for axes in grid[len(series) + 1 :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _by_parameter(rows: Sequence[Row]) -> dict[tuple[str, str], list[FittedValue]]:
+    """What fits say of each parameter of each experiment."""
+    series: dict[tuple[str, str], list[FittedValue]] = {}
+    for row in rows:
+        for name, fitted in row["outcome"]["parameters"].items() if "outcome" in row else ():
+            series.setdefault((row["experiment"], name), []).append(fitted)
+    return series
+
+
+def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
+    """Each fit's value with its 95 % interval, or a histogram of very many."""
+    unit = values[0]["unit"]
+    if len(values) > SINGLE:
+        known = [fitted["value"] for fitted in values if fitted["determined"]]
+        axes.hist([fitted["value"] for fitted in values], 40, color=BEFORE, label="all")
+        axes.hist(known, 40, color=AFTER, label="determined")
+        axes.set(xlabel=unit, ylabel="fits")
+        return
+    for row, fitted in enumerate(values, 1):
+        colour = AFTER if fitted["determined"] else BEFORE
+        axes.plot([row, row], fitted["interval"], color=colour, linewidth=1.2)
+        axes.plot(row, fitted["value"], ".", color=colour)
+    axes.set(xlabel="fit", ylabel=unit, xlim=(0.5, len(values) + 0.5))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
+    """How long fits took, and how much of that was their search."""
+    pairs = [
+        (row["effort"]["seconds"], row["outcome"]["search_seconds"])
+        for row in rows
+        if "effort" in row and "outcome" in row
+    ]
+    whole, search = np.array(pairs).T
+    # Logarithmic, for first fits compile and take a hundred times as long as those that follow.
+    ends = min(whole.min(), search.min()), max(whole.max(), search.max())
+    bins = np.geomspace(max(ends[0], SHORTEST) / 1.1, max(ends[1], SHORTEST) * 1.1, 30).tolist()
+    axes.hist(whole, bins, color=AFTER, alpha=0.8, label="fit")
+    axes.hist(search, bins, color=CAPTURED, alpha=0.6, label="its search")
+    axes.set(xlabel="time, s", ylabel="fits", xscale="log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_title("time of a fit", fontsize=12)
+    axes.margins(y=0.35)  # room for the legend
+    axes.legend(loc="upper right")
+
+
+def write_page(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> None:
+    """Writes the page into the folder of the fits, whose picture is there."""
+    good = not (fits.failed or fits.unconverged or fits.interrupted or misfits(fits))
+    caption = (
+        "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
+        "grey where it does not; and how long fits took, on a logarithmic axis"
+    )
+    sections = []
+    if fits.finished:
+        blocks: list[Block] = [
+            Grid(parameter_table(fits), "Fitted values of all fits"),
+            Text(SPREAD),
+            *pages.embed(fits.folder, {FIGURE: caption}),
+        ]
+        sections.append(Section("Parameters", blocks))
+    if fits.failed:
+        sections.append(Section("Failed", [Grid(failure_table(fits), "Fits that failed")]))
+    sections.append(Section("Fits", [Grid(fit_table(fits), "All fits")]))
+    sections.append(_limits())
+    StudyPage(
+        kind="Many fits, each in a folder of its own",
+        title=listed([experiment.name for experiment in experiments]),
+        verdict=_verdict(fits),
+        good=good,
+        findings=findings(fits),
+        sections=sections,
+        asked=[
+            [experiment.name, f"{pages.system(experiment)}; {_clips(experiment)}"]
+            for experiment in experiments[:MANY]
+        ],
+        files={SUMMARY: "the tables"} | {name: TABLES[name] for name in tables},
+    ).write(fits.folder)
+
+
+def findings(fits: ManyFits) -> list[Finding]:
+    """Whether all are there, whether they converged, and what a fit takes."""
+    return [_completeness(fits), _convergence(fits), _effort(fits)]
+
+
+def _clips(experiment: Experiment) -> str:
+    count = len(experiment.clips)
+    return f"{count} clip{'s' * (count != 1)}"
+
+
+def _verdict(fits: ManyFits) -> str:
+    if fits.failed:
+        return f"{len(fits.failed)} failed"
+    if len(fits.finished) < fits.total:
+        return f"{fits.total - len(fits.finished)} are missing"
+    if fits.unconverged:
+        return f"{len(fits.unconverged)} not converged"
+    bad = misfits(fits)
+    return f"All converged, {bad} do{'es' * (bad == 1)} not match" if bad else "All converged"
+
+
+def _completeness(fits: ManyFits) -> Finding:
+    count = len(fits.finished)
+    if fits.failed:
+        reasons = "; ".join(share_by_error(fits)).rstrip(".")
+        return Finding(f"{len(fits.failed)} of {fits.total} fits failed: {reasons}.", bad=True)
+    if count < fits.total:
+        return Finding(f"{count} of {fits.total} fits are there; the same command goes on.", True)
+    return Finding(f"All {fits.total} fits are finished.")
+
+
+def _convergence(fits: ManyFits) -> Finding:
+    outcomes = [row["outcome"] for row in fits.finished if "outcome" in row]
+    if not outcomes:
+        return Finding("No fit is finished, so nothing was found.", bad=True)
+    bad = misfits(fits)
+    text = f"{len(outcomes) - bad} of {len(outcomes)} match the motion to within the given sigmas"
+    if fits.unconverged:
+        runs = listed([row["run"] for row in fits.unconverged])
+        return Finding(f"{len(fits.unconverged)} did not converge ({runs}); {text}.", bad=True)
+    return Finding(f"All finished searches converged; {text}.", bad=bad > 0)
+
+
+def _effort(fits: ManyFits) -> Finding:
+    efforts = [row["effort"] for row in fits.finished if "effort" in row]
+    if not efforts:
+        return Finding("Nothing is known of what a fit takes.")
+    seconds = statistics.median(effort["seconds"] for effort in efforts)
+    minutes = sum(effort["cpu_seconds"] for effort in efforts) / 60
+    cpu = f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+    hosts = len({effort["host"] for effort in efforts})
+    return Finding(
+        f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on {hosts} "
+        f"machine{'s' * (hosts != 1)}."
+    )
+
+
+def _limits() -> Section:
+    lines = [
+        "Each clip is fitted as if there were no others: that values differ does not say that "
+        "people do. `jaxik population` tells spread from uncertainty.",
+        "Fits of one clip with several seeds differ by their search only.",
+    ]
+    return Section("Limits of the data", [Points(lines)])

@@ -1,0 +1,445 @@
+"""What is fitted: each clip of each experiment, with each seed, in a run folder of its own.
+
+runs/EXPERIMENT/CLIP/seed_0   where a clip is fitted alone
+runs/EXPERIMENT/seed_0        where the clips of an experiment are fitted together
+"""
+
+import csv
+import dataclasses
+import functools
+import hashlib
+import io
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NotRequired, TypeAlias, TypedDict
+
+from fitting.experiment import file_tables
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.experiment_files import experiment_to_toml
+from fitting.runtime import files
+from fitting.runtime.cluster import Effort
+from fitting.runtime.json_files import Finite, JsonFile
+from fitting.studies.fit.fit import Fit, Interval
+from fitting.studies.population.population import clip_names
+
+RUNS = "runs"
+TOGETHER = "all clips"
+MAX_SEEDS = 10_000
+
+
+ROW = "row.json"
+
+
+CSV, PARQUET = "fits.csv", "fits.parquet"
+MISSING = f"no {PARQUET}, as pyarrow is not installed: pip install 'jaxik[parquet]'"
+Cells: TypeAlias = dict[str, Any]  # by column
+OUTCOME = (
+    "converged", "fits", "verdict", "cost_before", "cost", "starts", "agreeing", "steps",
+    "search_seconds", "frames",
+)  # fmt: skip
+EFFORT = ("seconds", "waited", "cpu_seconds", "peak_mb", "host", "process")
+WHAT = ("experiment", "clip", "seed", "run", "state", "error")
+
+
+@dataclasses.dataclass(frozen=True)
+class FitTask:
+    """One fit."""
+
+    experiment: Experiment
+    """As it is fitted: with its own clips and seed."""
+    name: str
+    """Of the experiment from which it comes."""
+    clip: str
+    run: Path
+    """From the folder of all fits."""
+
+    def identity(self) -> str:
+        """64 characters that change with the experiment and with the content of its files."""
+        entries = tuple(_with_paths(entry, _name_of) for entry in self.experiment.clips)
+        text = experiment_to_toml(dataclasses.replace(self.experiment, clips=entries))
+        contents = [
+            _digest(value)
+            for entry in self.experiment.clips
+            for value in vars(entry).values()
+            if isinstance(value, Path)
+        ]
+        return hashlib.sha256(repr((text, contents)).encode()).hexdigest()
+
+
+def plan(
+    experiments: Sequence[Experiment], seeds: int = 1, *, together: bool = False
+) -> list[FitTask]:
+    """All fits, in the order of experiments, clips and seeds.
+
+    Args:
+        experiments: each with one clip or more.
+        seeds: fits of each clip, with the experiment's seed and those that follow it.
+        together: whether the clips of an experiment are fitted together, as `jaxik fit` does.
+
+    Raises:
+        ValueError: there is no experiment, or not one seed; a capture of one of several clips is
+            fitted, which each would be alone.
+    """
+    if not experiments:
+        raise ValueError("no experiments; wanted one or more")
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise ValueError(f"seeds is {seeds}; wanted 1 to {MAX_SEEDS}")
+    names = _distinct([_stem(experiment) for experiment in experiments])
+    tasks = []
+    for name, experiment in zip(names, experiments, strict=True):
+        for clip, part, folder in _parts(_with_whole_paths(experiment), together=together):
+            for seed in range(experiment.seed, experiment.seed + seeds):
+                run = Path(RUNS, name, *folder, f"seed_{seed}")
+                tasks.append(FitTask(dataclasses.replace(part, seed=seed), name, clip, run))
+    return tasks
+
+
+def _parts(
+    experiment: Experiment, *, together: bool
+) -> list[tuple[str, Experiment, tuple[str, ...]]]:
+    """The name of what is fitted, its experiment, and its folder."""
+    clips = clip_names(experiment.clips)
+    if together:
+        return [(clips[0] if len(clips) == 1 else TOGETHER, experiment, ())]
+    file_tables.check_unnumbered(experiment.capture, str(experiment.path))
+    folders = _distinct([_file_name(clip) for clip in clips])
+    return [
+        (clip, _alone(experiment, entry), (folder,))
+        for clip, entry, folder in zip(clips, experiment.clips, folders, strict=True)
+    ]
+
+
+def _alone(experiment: Experiment, entry: ClipEntry) -> Experiment:
+    """The experiment with one of its clips, from which nothing differs any more."""
+    shared = dataclasses.replace(experiment.hierarchy, per_clip=(), per_subject=())
+    whole = None if experiment.whole is None else _alone(experiment.whole, entry)
+    return dataclasses.replace(experiment, clips=(entry,), hierarchy=shared, whole=whole)
+
+
+def _with_whole_paths(experiment: Experiment) -> Experiment:
+    """The experiment for a process in another folder."""
+    whole = None if experiment.whole is None else _with_whole_paths(experiment.whole)
+    clips = tuple(_with_paths(entry, Path.absolute) for entry in experiment.clips)
+    return dataclasses.replace(experiment, clips=clips, whole=whole)
+
+
+def _stem(experiment: Experiment) -> str:
+    return _file_name(experiment.path.stem or experiment.name or "experiment")
+
+
+def _file_name(text: str) -> str:
+    """A name as a folder may have it on any system."""
+    return re.sub(r"[^\w.-]+", "_", text).strip("._")[:80] or "unnamed"
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number where several are alike."""
+    counts = Counter(name.casefold() for name in names)
+    return [
+        f"{name}_{number}" if counts[name.casefold()] > 1 else name
+        for number, name in enumerate(names, 1)
+    ]
+
+
+def _with_paths(entry: ClipEntry, change: Callable[[Path], Path]) -> ClipEntry:
+    """An entry with each of its paths changed."""
+    paths = {key: change(value) for key, value in vars(entry).items() if isinstance(value, Path)}
+    return dataclasses.replace(entry, **paths)
+
+
+def _name_of(path: Path) -> Path:
+    """A file by its name only: it may be moved."""
+    return Path(path.name)
+
+
+def _digest(path: Path) -> str:
+    """Of a file's content; of one that cannot be read, why, which the fit then says better."""
+    try:
+        status = path.stat()
+        return _digest_of_state(path, status.st_size, status.st_mtime_ns)
+    except OSError as error:
+        return str(error.strerror)
+
+
+@functools.lru_cache(maxsize=4096)  # a terrain may belong to thousands of clips
+def _digest_of_state(path: Path, size: int, changed: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class FittedValue(TypedDict):
+    """What a fit says of a parameter."""
+
+    value: Finite
+    unit: str
+    interval: Interval
+    """95 %."""
+    determined: bool
+
+
+class Outcome(TypedDict):
+    """What a fit found."""
+
+    converged: bool
+    fits: bool
+    verdict: str
+    """One sentence."""
+    cost_before: Finite
+    cost: Finite
+    starts: int
+    agreeing: int
+    steps: int
+    search_seconds: float
+    """Of the effort; all else prepares and assesses."""
+    frames: int
+    """Of its clips."""
+    parameters: dict[str, FittedValue]
+
+
+class Row(TypedDict):
+    """A fit that was tried."""
+
+    experiment: str
+    clip: str
+    seed: int
+    run: str
+    """From the folder of all fits."""
+    state: Literal["finished", "failed"]
+    error: str
+    """Why it failed, in one line; empty where it did not."""
+    identity: str
+    notes: list[str]
+    """Warnings."""
+    outcome: NotRequired[Outcome]
+    effort: NotRequired[Effort]
+
+
+ROW_FILE = JsonFile(Row, "written by `jaxik fit-many`", "delete it to fit anew")
+
+
+def outcome_of(fitted: Fit) -> Outcome:
+    """What a finished fit found."""
+    summary = fitted.summary
+    return {
+        "converged": summary["converged"],
+        "fits": summary["goodness"]["fits"],
+        "verdict": summary["goodness"]["sentence"],
+        "cost_before": summary["cost_before"],
+        "cost": summary["cost"],
+        "starts": summary["starts"],
+        "agreeing": summary["agreeing"],
+        "steps": summary["steps"],
+        "search_seconds": summary["seconds"],
+        "frames": sum(scene.frames.dt.shape[0] for scene in fitted.problem.data),
+        "parameters": {
+            row["name"]: {
+                "value": row["value"],
+                "unit": row["unit"],
+                "interval": row["interval"],
+                "determined": row["determined"],
+            }
+            for row in summary["parameters"]
+        },
+    }
+
+
+def finished_row(task: FitTask, outcome: Outcome, effort: Effort, notes: list[str]) -> Row:
+    """The row of a fit that is whole."""
+    row = _row(task, "finished", "")
+    row["notes"], row["outcome"], row["effort"] = notes, outcome, effort
+    return row
+
+
+def failed_row(task: FitTask, error: str) -> Row:
+    """The row of a fit that could not be made."""
+    return _row(task, "failed", error)
+
+
+def kept_row(folder: Path, task: FitTask) -> Row | None:
+    """The row of a fit that is whole already, in the folder of all fits; None if there is none.
+
+    Raises:
+        ValueError: the folder has the fit of an experiment that was changed since.
+    """
+    path = folder / task.run / ROW
+    if not path.is_file():
+        return None
+    row = ROW_FILE.read(path)
+    if row["identity"] != task.identity():
+        raise ValueError(
+            f"{path.parent}: has the fit of another experiment, or of one that has changed since; "
+            "name another folder, or delete this one to fit it anew"
+        )
+    return row
+
+
+def write_row(folder: Path, row: Row) -> None:
+    """Says that a run is whole."""
+    ROW_FILE.write(folder / row["run"] / ROW, row)
+
+
+def _row(task: FitTask, state: Literal["finished", "failed"], error: str) -> Row:
+    return {
+        "experiment": task.name,
+        "clip": task.clip,
+        "seed": task.experiment.seed,
+        "run": task.run.as_posix(),
+        "state": state,
+        "error": error,
+        "identity": task.identity(),
+        "notes": [],
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class ManyProgress:
+    """How far many fits are; reported with each that ends."""
+
+    done: int
+    """Those of earlier calls included."""
+    total: int
+    failed: int
+    elapsed: float
+    """s, of this call."""
+    made: int
+    """In this call."""
+
+    @property
+    def rate(self) -> float:
+        """Fits a minute, in this call."""
+        return 60.0 * self.made / max(self.elapsed, 1e-9)
+
+    @property
+    def remaining(self) -> float:
+        """s, estimated; infinite before the first fit of this call is done."""
+        return 60.0 * (self.total - self.done) / self.rate if self.made else float("inf")
+
+
+@dataclasses.dataclass(frozen=True)
+class ManyFits:
+    """Many fits, each with its row, in the order in which they were planned."""
+
+    rows: tuple[Row, ...]
+    """None of fits that an interrupt has left out."""
+    total: int
+    folder: Path
+    elapsed: float = 0.0
+    """s, of this call."""
+    made: int = 0
+    """In this call."""
+    interrupted: bool = False
+
+    @property
+    def finished(self) -> list[Row]:
+        """The rows of fits that are whole."""
+        return [row for row in self.rows if row["state"] == "finished"]
+
+    @property
+    def failed(self) -> list[Row]:
+        """The rows of fits that could not be made."""
+        return [row for row in self.rows if row["state"] == "failed"]
+
+    @property
+    def unconverged(self) -> list[Row]:
+        """The rows of finished fits whose search has not converged."""
+        return [
+            row for row in self.finished if "outcome" in row and not row["outcome"]["converged"]
+        ]
+
+
+class Tally:
+    """The rows of many fits: those that are kept from earlier calls, and new ones as they end."""
+
+    def __init__(self, folder: Path, tasks: Sequence[FitTask]) -> None:
+        """Looks for finished fits.
+
+        Raises:
+            ValueError: the folder has the fit of an experiment that was changed since.
+        """
+        self.folder, self.tasks = folder, tasks
+        kept = [kept_row(folder, task) for task in tasks]
+        self.missing = [task for task, row in zip(tasks, kept, strict=True) if row is None]
+        """The fits that are to be made."""
+        runs = [task.run.as_posix() for task in tasks]
+        self._rows = dict(zip(runs, kept, strict=True))
+        self._began = time.monotonic()
+        self._made = self._failed = 0
+
+    def add(self, row: Row) -> None:
+        """Takes the row of a fit that was missing."""
+        self._rows[row["run"]] = row
+        self._made += 1
+        self._failed += row["state"] == "failed"
+
+    def look_again(self) -> None:
+        """Takes the rows that were written and not yet told of, as an interrupt came between."""
+        for task in self.missing:
+            if self._rows[task.run.as_posix()] is None and (row := kept_row(self.folder, task)):
+                self.add(row)
+
+    def progress(self) -> ManyProgress:
+        """How far the fits are."""
+        done = len(self.tasks) - len(self.missing) + self._made
+        return ManyProgress(done, len(self.tasks), self._failed, self._elapsed, self._made)
+
+    def fits(self, *, interrupted: bool) -> ManyFits:
+        """All rows there are, in the order of the tasks."""
+        rows = tuple(row for row in self._rows.values() if row is not None)
+        total = len(self.tasks)
+        return ManyFits(rows, total, self.folder, self._elapsed, self._made, interrupted)
+
+    @property
+    def _elapsed(self) -> float:
+        return time.monotonic() - self._began
+
+
+def columns(rows: Sequence[Row]) -> list[str]:
+    """The names of all columns; those of parameters last, in the order in which they appear."""
+    parameters = dict.fromkeys(
+        name for row in rows if "outcome" in row for name in row["outcome"]["parameters"]
+    )
+    each = [f"{name}{ending}" for name in parameters for ending in ("", ".low", ".high", ".known")]
+    return [*WHAT, "notes", *OUTCOME, *EFFORT, *each]
+
+
+def cells(row: Row) -> Cells:
+    """A row of the table; what it has not is left out.
+
+    Of each parameter: its value under its name, both ends of its 95 % interval, and whether the
+    clip determines it.
+    """
+    content: Cells = {key: row[key] for key in WHAT} | {"notes": "; ".join(row["notes"])}
+    if "outcome" in row:
+        outcome = row["outcome"]
+        content |= {key: outcome[key] for key in OUTCOME}
+        for name, fitted in outcome["parameters"].items():
+            low, high = fitted["interval"]
+            content |= {name: fitted["value"], f"{name}.low": low, f"{name}.high": high}
+            content[f"{name}.known"] = fitted["determined"]
+    if "effort" in row:
+        content |= {key: row["effort"][key] for key in EFFORT}
+    return content
+
+
+def write(folder: Path, rows: Sequence[Row]) -> list[str]:
+    """Writes the table; returns the names of its files, without that for which pyarrow is missing.
+
+    Raises:
+        ValueError: the folder cannot be written to.
+    """
+    names, content = columns(rows), [cells(row) for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(content)
+    files.write_text(folder / CSV, text.getvalue())
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        return [CSV]
+    table = pyarrow.table({name: [row.get(name) for row in content] for name in names})
+    files.write(folder / PARQUET, lambda path: pyarrow.parquet.write_table(table, path))
+    return [CSV, PARQUET]

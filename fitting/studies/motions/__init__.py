@@ -1,1 +1,0 @@
-"""Whole skeletons of what studies are about, for run folders and pages."""

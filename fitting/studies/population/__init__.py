@@ -1,0 +1,5 @@
+"""Fits of several clips and subjects: each alone, pooled, and as a population of a mixed model.
+
+`population` computes them, `kept_searches` keeps those of subjects, `population_report` says and
+shows what they found.
+"""

@@ -1,0 +1,397 @@
+"""An experiment's clips fitted each alone, all pooled, and as a population."""
+
+import dataclasses
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypedDict
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import jaxik
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.inference.mixed_model import (
+    Draws,
+    Grouping,
+    PopulationFit,
+    check_thresholds,
+    expand,
+    fit_population,
+    model_around,
+)
+from fitting.inference.optimise.solution import Progress
+from fitting.motion.accuracy import position_error
+from fitting.problem.problem import Problem
+from fitting.problem.space import INTERVAL, Space
+from fitting.runtime import activity
+from fitting.runtime.precision import in_float64
+from jaxik.maths import parameter_tree
+
+from .kept_searches import Found, KeptSearches
+
+DRAWS = 2000  # from the hierarchy
+NORMAL = 1.96  # standard deviations in half a 95 % interval
+
+EVERYTHING = "all clips"
+
+
+class Estimate(TypedDict):
+    """A value with its 95 % interval; a threshold has none."""
+
+    value: float
+    interval: list[float] | None
+
+
+class ParameterEstimates(TypedDict):
+    """What was found for a parameter, in its unit, as `population.json` holds it."""
+
+    name: str
+    unit: str
+    level: str
+    """What has a value of its own: `clip` or `subject`; else it is `shared`."""
+    alone: list[Estimate]
+    """Of each clip, by itself."""
+    pooled: Estimate
+    """Of all clips together, with one value."""
+    clips: list[Estimate]
+    """Of each clip in the population."""
+    centre: Estimate
+    """Of the population."""
+    spread: Estimate | None
+    """Standard deviation in the population, of u; None where shared."""
+    range: list[float] | None
+    """In which another clip or subject is expected with 95 %; None where shared."""
+
+
+@in_float64
+def summarise(
+    problems: Sequence[Problem],
+    alone: Float[np.ndarray, "clips free"],
+    pooled: Float[np.ndarray, " free"],
+    fit: PopulationFit,
+    levels: Sequence[str],
+) -> list[ParameterEstimates]:
+    """The estimates of all parameters, in the order of `u`.
+
+    Args:
+        problems: of one clip each.
+        alone: the best fit of each clip, in u.
+        pooled: that of all clips together.
+        fit: of the population.
+        levels: at which each parameter varies.
+    """
+    space = problems[0].space
+    of_clips = [_laplace([problem], u[None]) for problem, u in zip(problems, alone, strict=True)]
+    of_pooled = _laplace(problems, np.tile(pooled, (len(problems), 1)))
+    random = np.random.default_rng(0)
+    draws = fit.model.draw(random, DRAWS)
+    new = draws.centre + draws.spread * random.normal(size=draws.centre.shape)
+    centres = _quantiles(space, fit, draws.centre)
+    expected = _quantiles(space, fit, new)
+    members = [_quantiles(space, fit, draws.clips[:, c]) for c in range(len(problems))]
+    at_centre, at_clips = _values(space, fit.centre[None])[0], _values(space, fit.clips)
+    units = parameter_tree.declarations(space.system)
+    rows: list[ParameterEstimates] = []
+    for k, parameter in enumerate(space.parameters):
+        smooth = bool(fit.smooth[k])
+
+        def estimate(value: float, interval: np.ndarray, smooth: bool = smooth) -> Estimate:
+            return {"value": float(value), "interval": interval.tolist() if smooth else None}
+
+        varies = levels[k] != "shared"
+        rows.append(
+            {
+                "name": parameter.name,
+                "unit": units[parameter.leaf].unit,
+                "level": levels[k],
+                "alone": [estimate(value[k], interval[k]) for value, interval in of_clips],
+                "pooled": estimate(of_pooled[0][k], of_pooled[1][k]),
+                "clips": [
+                    estimate(at_clips[c, k], interval[k]) for c, interval in enumerate(members)
+                ],
+                "centre": estimate(at_centre[k], centres[k]),
+                "spread": _spread(fit, draws, k) if varies else None,
+                "range": expected[k].tolist() if varies else None,
+            }
+        )
+    return rows
+
+
+def _spread(fit: PopulationFit, draws: Draws, k: int) -> Estimate:
+    density = draws.spread_density[np.flatnonzero(fit.smooth).tolist().index(k)]
+    return {"value": float(fit.spread[k]), "interval": list(density.interval())}
+
+
+def _laplace(
+    problems: Sequence[Problem], u: Float[np.ndarray, "clips free"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (free,) and 95 % intervals (free, 2) of clips that share everything."""
+    space = problems[0].space
+    grouping = Grouping.pooled(*u.shape)
+    model = model_around(expand(problems, u), space, grouping, u[0])
+    smooth = np.flatnonzero(space.smooth)
+    estimate = model.estimate(np.zeros(len(smooth)))
+    moves = np.zeros((space.size, space.size))
+    moves[smooth, smooth] = NORMAL * estimate.centre_sd
+    values = _values(space, np.concatenate([u[:1], u[0] - moves, u[0] + moves]))
+    low, high = np.split(values[1:], 2)
+    return values[0], np.stack([np.diag(low), np.diag(high)], axis=1)
+
+
+def _quantiles(
+    space: Space, fit: PopulationFit, draws: Float[np.ndarray, "draws smooth"]
+) -> Float[np.ndarray, "free 2"]:
+    """Central 95 % of draws of the smooth parameters, in the parameters' units."""
+    u = np.tile(fit.centre, (len(draws), 1))
+    u[:, fit.smooth] = draws
+    return np.quantile(_values(space, u), INTERVAL, axis=0).T
+
+
+def _values(space: Space, u: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
+    return np.asarray(space.values(u))
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipErrors:
+    """Distance of a clip's joints from the captured ones, m, rms; see `position_error`."""
+
+    clip: str
+    alone: float
+    """Fitted to this clip."""
+    pooled: float
+    """Fitted to all clips with one value of each parameter."""
+    population: float
+    """With the clip's own parameters in the population."""
+    left_out_pooled: float
+    """Fitted to all other clips."""
+    left_out_population: float
+    """As expected from the population of all others, and of the clip's subject if they show it."""
+
+
+def without_clip(problem: Problem[jaxik.FootIK], clip: int) -> Problem[jaxik.FootIK]:
+    """The problem in which a clip has no say: none of its frames was observed.
+
+    The clip is still played, so that the programs of the whole problem serve.
+    """
+    observed = problem.data[clip].reference.observed
+    return eqx.tree_at(lambda p: p.data[clip].reference.observed, problem, jnp.zeros_like(observed))
+
+
+def predict(
+    problems: Sequence[Problem[jaxik.FootIK]],
+    grouping: Grouping,
+    fit: PopulationFit,
+    pooled: Float[np.ndarray, " free"],
+    clip: int,
+    progress: Callable[[int, float], None],
+) -> Float[np.ndarray, " free"]:
+    """The parameters of a clip, in u, as the population of the others expects them.
+
+    Args:
+        problems: of one clip each.
+        grouping: of all clips.
+        fit: of all clips, where the search begins.
+        pooled: the best fit of all clips but this one, where it begins too; in u.
+        clip: the one that is left out.
+        progress: as for `fit_population`.
+    """
+    rest = [problem for c, problem in enumerate(problems) if c != clip]
+    starts = [np.tile(pooled, (len(rest), 1)), np.delete(fit.clips, clip, axis=0)]
+    return fit_population(rest, grouping.without(clip), starts, progress).predict(grouping, clip)
+
+
+def error_at(problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"]) -> float:
+    """The error of a problem's only clip with these parameters, m."""
+    (scene,) = problem.data
+    return position_error(problem.space.unpack(jnp.asarray(u)), scene)
+
+
+class PopulationSummary(TypedDict):
+    """The content of `population.json`."""
+
+    experiment: str
+    clips: list[str]
+    subjects: list[str]
+    converged: bool
+    message: str
+    leg_length: float | None
+    """m, of the body that the values are for; None if they fit any body as they are."""
+    parameters: list[ParameterEstimates]
+    errors: list[dict[str, str | float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Population:
+    """The clips of an experiment, fitted each alone, pooled, and as a population."""
+
+    experiment: Experiment
+    problem: Problem[jaxik.FootIK]
+    """Of all clips."""
+    clips: tuple[str, ...]
+    """A name for each."""
+    subjects: tuple[str, ...]
+    """Whom each shows; the clip's own name where the experiment does not say."""
+    alone: tuple[Found, ...]
+    pooled: Found
+    others: tuple[Found, ...]
+    """All clips but each, pooled."""
+    fit: PopulationFit
+    parameters: list[ParameterEstimates]
+    errors: list[ClipErrors]
+
+    @property
+    def converged(self) -> bool:
+        """Whether all searches and the fit of the population have."""
+        return not self.unconverged
+
+    @property
+    def unconverged(self) -> list[str]:
+        """What has not converged, in a sentence each."""
+        searches = (*self.alone, self.pooled, *self.others)
+        lines = [f"{one['name']}: {one['message']}" for one in searches if not one["converged"]]
+        if not self.fit.converged:
+            lines.append(f"population: not converged after {self.fit.rounds} rounds")
+        return lines
+
+    @property
+    def leg_length(self) -> float | None:
+        """Leg length, m, of the body that the values are for; None if they fit any body."""
+        return self.experiment.leg_length(self.problem.data[0].rig)
+
+    @property
+    def summary(self) -> PopulationSummary:
+        """The numbers as JSON holds them."""
+        return {
+            "experiment": self.experiment.name,
+            "clips": list(self.clips),
+            "subjects": list(self.subjects),
+            "converged": self.converged,
+            "message": " ".join(self.unconverged),
+            "leg_length": self.leg_length,
+            "parameters": self.parameters,
+            "errors": [dataclasses.asdict(row) for row in self.errors],
+        }
+
+
+def clip_names(entries: Sequence[ClipEntry]) -> tuple[str, ...]:
+    """A name for each clip: that of its file, and where a file has several, which part of it."""
+    stems = [entry.reference.stem for entry in entries]
+    counts = Counter(stems)
+    names = [
+        f"{stem} from {entry.start:g} s" if counts[stem] > 1 else stem
+        for stem, entry in zip(stems, entries, strict=True)
+    ]
+    counts = Counter(names)
+    return tuple(
+        f"{name} ({number})" if counts[name] > 1 else name for number, name in enumerate(names, 1)
+    )
+
+
+@in_float64
+def fit_clips_and_population(
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    folder: Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_found: Callable[[Found], object] = lambda found: None,
+) -> Population:
+    """Fits each clip alone, all pooled, the population, and all without each clip in turn.
+
+    Noise that the experiment estimates is estimated in each clip alone, where no difference between
+    clips counts as noise, and is taken from there.
+
+    Args:
+        experiment: with parameters that vary between clips or subjects.
+        problem: of the experiment.
+        folder: where finished searches are kept; what it has is not repeated. None keeps none.
+        progress: called as a search goes on; its stage names what is fitted.
+        on_found: called with each new search.
+
+    Raises:
+        KeyboardInterrupt: it was interrupted; finished searches are in the folder.
+        ValueError: nothing varies, or a threshold does; the folder holds something else.
+    """
+    if not experiment.hierarchy.varying:
+        raise ValueError(
+            f"{experiment.path}: nothing varies between the clips; name free parameters in the "
+            "table [hierarchy], as per_clip or as per_subject"
+        )
+    clips, names = clip_names(experiment.clips), problem.space.names
+    subjects = tuple(
+        entry.subject or clip for entry, clip in zip(experiment.clips, clips, strict=True)
+    )
+    grouping = experiment.hierarchy.grouping(names, clips, subjects)
+    check_thresholds(problem.space, grouping)
+    searches = KeptSearches(experiment, folder, progress, on_found)
+    problems, alone = [], []
+    for name, scene in zip(clips, problem.data, strict=True):
+        single = eqx.tree_at(lambda p: p.data, problem, (scene,))
+        single, found = searches.fit(name, single, with_its_noise=True)
+        problems.append(single)
+        alone.append(found)
+    pooled_problem = _joined(problem, problems)
+    _, pooled = searches.fit(EVERYTHING, pooled_problem)
+    alone_u, pooled_u = np.array([found["u"] for found in alone]), np.array(pooled["u"])
+    rounds = _Rounds(progress)
+    starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
+    with activity.announced("Fitting the population"):
+        fit = fit_population(problems, grouping, starts, rounds.of("population"))
+    errors, others = [], []
+    for c, name in enumerate(clips):
+        rest = f"{EVERYTHING} but {name}"
+        others.append(searches.fit(rest, without_clip(pooled_problem, c))[1])
+        others_u = np.array(others[c]["u"])
+        with activity.announced(f"Predicting {name} from the others"):
+            expected = predict(
+                problems, grouping, fit, others_u, c, rounds.of(f"{rest}, population")
+            )
+            points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
+            errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
+    levels = [experiment.hierarchy.level(name) for name in names]
+    return Population(
+        experiment=experiment,
+        problem=problem,
+        clips=clips,
+        subjects=subjects,
+        alone=tuple(alone),
+        pooled=pooled,
+        others=tuple(others),
+        fit=fit,
+        parameters=summarise(problems, alone_u, pooled_u, fit, levels),
+        errors=errors,
+    )
+
+
+def _joined(
+    problem: Problem[jaxik.FootIK], problems: Sequence[Problem[jaxik.FootIK]]
+) -> Problem[jaxik.FootIK]:
+    """The problem of all clips, each with its own sigmas and correlations.
+
+    What only a whole problem has, the independent fraction and Student's tails, is their mean.
+    """
+    fraction = jnp.mean(jnp.stack([single.weight for single in problems]))
+    tails = jnp.mean(jnp.stack([single.tails for single in problems]))
+    scenes = tuple(scene for single in problems for scene in single.data)
+    return eqx.tree_at(lambda p: (p.data, p.weight, p.tails), problem, (scenes, fraction, tails))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rounds:
+    """Reports the rounds of a population's fit as a search does its steps."""
+
+    progress: Callable[[Progress], None] | None
+    began: float = dataclasses.field(default_factory=time.perf_counter)
+
+    def of(self, name: str) -> Callable[[int, float], None]:
+        """What to call after each round."""
+
+        def report(rounds: int, cost: float) -> None:
+            if self.progress is not None:
+                elapsed = time.perf_counter() - self.began
+                self.progress(Progress(name, 0, rounds, cost, cost, elapsed))
+
+        return report

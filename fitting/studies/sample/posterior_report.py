@@ -1,0 +1,446 @@
+"""The report of a sampling: text for the terminal, and its section of the run's summary.md."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
+from fitting.inference.sample.diagnostics import ParameterSummary
+from fitting.inference.sample.modes import MIN_EXCHANGES, Island
+from fitting.inference.sample.posterior import Posterior
+from fitting.problem.space import Space
+from fitting.report import pages
+from fitting.report.formatting import (
+    RESIDUALS,
+    Table,
+    aligned,
+    bullets,
+    interval,
+    joined,
+    markdown,
+    number,
+    percent,
+)
+from fitting.report.style import AFTER, CAPTURED, legend, styled
+from fitting.runtime import activity, files
+from fitting.studies.fit import goodness_report
+from fitting.studies.fit.fit_report import gallery, save_plot
+from fitting.studies.fit.fit_tables import Truth
+from fitting.studies.fit.run_folder import LOWER_POINT, SUMMARY
+
+from . import posterior_plots
+from .predictive import SURPRISING, Band, Disagreement, PredictiveCheck, Statistic
+from .prior_report import posterior_prior_section
+from .replay import Replay
+from .sample import SampledFit
+
+HEADING = "## Posterior"  # what follows it in summary.md is replaced
+
+START, END = "<!-- posterior -->", "<!-- /posterior -->"  # no text of a user can hold them
+
+MAX_CLIPS = 4  # that are drawn
+
+SHOWN = 5  # blocks in the table
+CORRELATED = 0.3  # between neighbouring blocks, from which the standard error is too small
+
+
+def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
+    """The result of a sampling, for the terminal; `run` is the folder where it is written."""
+    posterior, known_values = sampled.posterior, sampled.known_values
+    table = aligned(posterior_table(posterior, known_values, {}))
+    parts = [*_health(posterior), *contradiction_sentences(sampled, run)]
+    if sampled.replay is not None:
+        parts.append(predictive_sentence(sampled.replay.checks))
+    if sampled.left_out is not None:
+        parts.append(left_out_sentence(sampled.left_out))
+    parts += ["", table]
+    if posterior.sigmas:
+        parts += ["", aligned(goodness_report.sigma_table(posterior.sigmas))]
+    if known_values:
+        count = covered(posterior, known_values, posterior.names)
+        parts += ["", f"The 95 % intervals contain the true values of {count} parameters."]
+    return joined(parts)
+
+
+def write_posterior(run: Path, sampled: SampledFit) -> None:
+    """Writes the plots of a posterior, and its part of summary.md and page in place of older ones.
+
+    Args:
+        run: the folder of the run.
+        sampled: the posterior and the fit.
+    """
+    experiment, posterior = sampled.experiment, sampled.posterior
+    known_values = sampled.known_values
+    rows = {row["name"]: row for row in sampled.parameters}
+    units = {name: row["unit"] for name, row in rows.items()}
+    labels = [f"{name}, {units[name]}" if units[name] != "1" else name for name in posterior.names]
+    values = {name: row["value"] for name, row in rows.items()}
+    with activity.announced("Drawing the posterior"):
+        title = f"{experiment.name}: posterior of the parameters"
+        figure = posterior_plots.corner(
+            posterior, labels, values, known_values, title, space=sampled.space
+        )
+        plots = save_plot(run, "corner.png", title, figure)
+        title = f"{experiment.name}: walkers"
+        figure = posterior_plots.chain(posterior, labels, known_values, title)
+        plots |= save_plot(run, "chain.png", title, figure)
+
+    contradictions = contradiction_sentences(sampled, run)
+    table = posterior_table(posterior, known_values, units)
+    insert(run, contradictions, _health(posterior), table)
+    parts = [HEADING, *(f"**{line}**" for line in contradictions)]
+    parts += [bullets(_health(posterior)), markdown(table)]
+    if posterior.sigmas:
+        parts.append("Sigmas of the noise, which were sampled along:")
+        parts.append(markdown(goodness_report.sigma_table(posterior.sigmas)))
+    if known_values:
+        determined = [name for name, row in rows.items() if row["determined"]]
+        all_count = covered(posterior, known_values, posterior.names)
+        determined_count = covered(posterior, known_values, determined)
+        parts.append(
+            f"The 95 % intervals contain the true values of {all_count} parameters; among those "
+            f"that the fit calls determined, of {determined_count}."
+        )
+    parts += island_section(posterior, sampled.space, units)
+    parts += posterior_prior_section(sampled, units)
+    if sampled.replay is not None:
+        parts += predictive_section(sampled.replay)
+        title = f"{experiment.name}: the capture inside what the posterior would make"
+        figure = bands(sampled.replay.bands, title)
+        plots |= save_plot(run, "predictive.png", title, figure)
+    if sampled.left_out is not None and sampled.replay is not None:
+        parts += left_out_section(sampled.left_out, sampled.replay.blocks)
+    parts.append(gallery(plots))
+    summary = run / SUMMARY
+    text = f"# {experiment.name}\n"
+    if summary.is_file():
+        text = summary.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
+    before = text.partition(f"\n{HEADING}\n")[0].rstrip()
+    files.write_text(summary, before + "\n\n" + "\n\n".join(parts) + "\n")
+
+
+def _health(posterior: Posterior) -> list[str]:
+    """How the sampling went, a sentence each."""
+    steps, walkers = posterior.u.shape[0] * posterior.thin_by, posterior.u.shape[1]
+    stuck = ", ".join(map(str, posterior.stuck)) or "none"
+    return [
+        posterior.message,
+        f"{walkers} walkers, {steps} steps, the first {posterior.burn_in * posterior.thin_by} left "
+        f"out as burn-in; {posterior.seconds:.0f} s in the last call.",
+        f"Mean acceptance {percent(float(posterior.acceptance.mean()))}; slowest "
+        f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
+        f"Stuck walkers: {stuck}.",
+        *island_sentences(posterior),
+    ]
+
+
+def posterior_table(posterior: Posterior, truth: Truth, units: Mapping[str, str]) -> Table:
+    """Parameters of a posterior: moments, intervals, how well they are sampled.
+
+    Args:
+        posterior: after sampling.
+        truth: known values by name; where there are any, the last column says whether the 95 %
+            interval contains them.
+        units: of the parameters, by name; empty to leave the column out.
+    """
+    heading = ["parameter", *(["unit"] if units else []), "mean", "sd", "median", "68 % interval"]
+    heading += ["95 % interval", "ESS", "R-hat", "autocorrelation"]
+    table = [heading + (["truth", "covered"] if truth else [])]
+    for row, steps in zip(posterior.summary, posterior.autocorrelation_time, strict=True):
+        cells = [row["name"], *([units[row["name"]]] if units else [])]
+        cells += [number(row[key]) for key in ("mean", "sd", "median")]
+        cells += [interval(row["low68"], row["high68"]), interval(row["low95"], row["high95"])]
+        cells += [f"{row['ess']:.0f}", f"{row['r_hat']:.3f}", f"{steps:.0f} steps"]
+        if truth:
+            true = truth.get(row["name"])
+            cells.append("unknown" if true is None else number(true))
+            cells.append("" if true is None else "yes" if covers(row, true) else "no")
+        table.append(cells)
+    return table
+
+
+def covered(posterior: Posterior, truth: Mapping[str, float], names: Sequence[str]) -> str:
+    """How many of these parameters have their true value within their 95 % interval."""
+    known = [row for row in posterior.summary if row["name"] in names and row["name"] in truth]
+    inside = sum(covers(row, truth[row["name"]]) for row in known)
+    return f"{inside} of {len(known)}"
+
+
+def covers(row: ParameterSummary, true: float) -> bool:
+    """Whether the 95 % interval of a posterior's row contains this value."""
+    return row["low95"] <= true <= row["high95"]
+
+
+def insert(run: Path, warnings: Sequence[str], lines: Sequence[str], table: Table) -> None:
+    """Shows a posterior on the page of a run, in place of an older one; not without a page.
+
+    Args:
+        run: the folder of the run.
+        warnings: where the chain contradicts the fit, a sentence each.
+        lines: how the sampling went, likewise.
+        table: the posterior of the parameters.
+    """
+    path = run / pages.PAGE
+    if not path.is_file():
+        return
+    page = path.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
+    before, start, rest = page.partition(START)
+    _, end, after = rest.partition(END)
+    if end:
+        section = pages.fragment("posterior.html", warnings=warnings, lines=lines, posterior=table)
+        files.write_text(path, f"{before}{start}\n{section}\n{end}{after}")
+
+
+@styled
+def bands(shown: Sequence[Band], title: str) -> Figure:
+    """One channel for each kind of residual, a column for each clip."""
+    clips = sorted({band.clip for band in shown})[:MAX_CLIPS]
+    kinds = list(dict.fromkeys(band.kind for band in shown))
+    figure = Figure(
+        figsize=(max(17, 8.5 * len(clips)), 2.6 * len(kinds) + 1.8), layout="constrained"
+    )
+    figure.suptitle(title)
+    grid = figure.subplots(max(len(kinds), 1), max(len(clips), 1), squeeze=False, sharex="col")
+    for band in shown:
+        if band.clip in clips:
+            axes = grid[kinds.index(band.kind), clips.index(band.clip)]
+            _draw(axes, band, clip=len(clips) > 1)
+    for axes in grid[-1]:
+        axes.set_xlabel("time, s")
+    legend(
+        figure,
+        Line2D([], [], color=CAPTURED, linewidth=2, label="captured"),
+        Line2D([], [], color=AFTER, linewidth=8, alpha=0.3, label="95 % of the replicates"),
+        Line2D([], [], color=AFTER, linewidth=2, label="median motion of the posterior"),
+    )
+    return figure
+
+
+def _draw(axes: Axes, band: Band, *, clip: bool) -> None:
+    name, unit, factor = RESIDUALS[band.kind]
+    axes.fill_between(
+        band.time, factor * band.low, factor * band.high, color=AFTER, alpha=0.3, linewidth=0
+    )
+    axes.axhline(0.0, color=AFTER, linewidth=1.5)
+    axes.plot(band.time, factor * band.captured, color=CAPTURED, linewidth=0.9)
+    axes.set_ylabel(unit)
+    axes.set_xlim(band.time[0], band.time[-1])
+    where = f"clip {band.clip + 1}, " if clip else ""
+    axes.set_title(
+        f"{where}{name.lower()}, {band.channel}: {percent(band.outside)} outside the band"
+    )
+
+
+def contradiction_sentences(sampled: SampledFit, run: Path | None) -> list[str]:
+    """What contradicts the fit, a sentence each, with how to go on; none if nothing does.
+
+    Args:
+        sampled: the posterior and the fit.
+        run: the folder of the run, if there is one.
+    """
+    return [*_lower_point(sampled, run), *map(_describe, sampled.disagreements)]
+
+
+def _lower_point(sampled: SampledFit, run: Path | None) -> Iterator[str]:
+    if not sampled.has_lower_point:
+        return
+    gain = sampled.posterior.improvement
+    if run is None:
+        go_on = "fit again with `[start]` at `Posterior.best_values`"
+    else:
+        go_on = f"go on from there with `jaxik fit {run / LOWER_POINT} -o {run}-lower`"
+    yield (
+        f"The chain contradicts its fit: it met a point whose log-probability is {gain:.3g} higher."
+        f" The fit is not the best one; {go_on}."
+    )
+
+
+def _describe(found: Disagreement) -> str:
+    sampled, fitted = interval(*found["interval"]), interval(*found["interval_of_fit"])
+    if found["reason"] == "leaves out the fit":
+        return (
+            f"The chain contradicts its fit: the 95 % interval of {found['name']}, {sampled}, "
+            f"leaves out the fitted value {number(found['value'])}."
+        )
+    return (
+        f"The chain contradicts its fit: the 95 % interval of {found['name']}, {sampled}, is "
+        f"clearly {found['reason']} than the fit's, {fitted}."
+    )
+
+
+def island_sentences(posterior: Posterior) -> list[str]:
+    """How many islands there are, what they weigh, and which walkers were left out and why."""
+    sentences = []
+    if posterior.islands:
+        weights = ", ".join(_weight(island) for island in posterior.islands)
+        sentences.append(f"The posterior has {len(posterior.islands)} islands: {weights}.")
+    if posterior.isolated:
+        walkers = ", ".join(map(str, posterior.isolated))
+        sentences.append(
+            f"Left out are walkers {walkers}, which never came near the others' log-probability; "
+            f"by its height and width, about {percent(posterior.isolated_mass, 2)} of the "
+            "posterior lies there."
+        )
+    return sentences
+
+
+def island_section(posterior: Posterior, space: Space, units: Mapping[str, str]) -> list[str]:
+    """Paragraphs of Markdown; none where there is one island only."""
+    islands = posterior.islands
+    if not islands:
+        return []
+    parts = [
+        "### Islands",
+        "Parts of the posterior that lie apart. Walkers come and go between them by jumps, so that "
+        "each weighs as many draws as it deserves; exchanges count how often one came or left.",
+        markdown(island_table(islands)),
+        "Medians on each island:",
+        markdown(median_table(islands, space, units)),
+    ]
+    if not all(island.is_weighed for island in islands):
+        parts.append(
+            f"Where there were fewer than {MIN_EXCHANGES} exchanges, the weight is out of reach: "
+            "there are as many draws as walkers happened to start there, and intervals over all "
+            "islands are no better. Sample longer, or narrow a prior to the island that is meant."
+        )
+    return parts
+
+
+def island_table(islands: tuple[Island, ...]) -> Table:
+    """Weight, exchanges and height of each island."""
+    table = [["island", "weight", "exchanges", "walkers at the end", "highest log-probability"]]
+    for index, island in enumerate(islands, 1):
+        table.append(
+            [
+                str(index),
+                _weight(island),
+                str(island.exchanges),
+                str(island.walkers),
+                number(island.log_probability),
+            ]
+        )
+    return table
+
+
+def median_table(islands: tuple[Island, ...], space: Space, units: Mapping[str, str]) -> Table:
+    """Median of each parameter on each island."""
+    values = np.asarray(space.values(np.stack([island.median for island in islands])))
+    heading = [f"island {index}" for index in range(1, len(islands) + 1)]
+    rows = zip(space.names, values.T, strict=True)
+    return [
+        ["parameter", "unit", *heading],
+        *([name, units[name], *map(number, row)] for name, row in rows),
+    ]
+
+
+def _weight(island: Island) -> str:
+    if math.isnan(island.error):
+        return f"out of reach ({percent(island.weight)} of the draws)"
+    return f"{percent(island.weight)} ± {percent(island.error)}"
+
+
+def left_out_sentence(found: LeaveOneOut) -> str:
+    """The figure, and how far it can be trusted."""
+    count = len(found.pareto_k)
+    text = (
+        f"Log predictive density of {count} blocks of {SECONDS:g} s, each left out in turn: "
+        f"{found.elpd:.1f} ± {found.error:.1f}; effective number of parameters "
+        f"{found.parameters:.1f}."
+    )
+    if found.unreliable:
+        text += (
+            f" Unreliable for {found.unreliable} of them, whose Pareto k is above {found.max_k:.2g}"
+            ": the fit hangs on them."
+        )
+    if found.neighbours > CORRELATED:
+        text += (
+            f" Neighbouring blocks correlate by {found.neighbours:.2f}, so that the standard error "
+            "is too small."
+        )
+    return text
+
+
+def left_out_section(found: LeaveOneOut, blocks: BlockLogLikelihood) -> list[str]:
+    """Paragraphs of Markdown."""
+    correlation = "unknown" if math.isnan(found.neighbours) else f"{found.neighbours:.2f}"
+    return [
+        "### Blocks of frames left out",
+        left_out_sentence(found),
+        f"By Pareto-smoothed importance sampling, without another fit. Blocks last {SECONDS:g} s, "
+        "two steps of a walk, because what one frame misses its neighbours give away; the "
+        f"correlation of neighbouring blocks is {correlation}. With "
+        "`jaxik compare --runs`, fits of several systems to the same clips are compared by this "
+        "figure. The blocks that are predicted worst:",
+        markdown(worst_blocks(found, blocks)),
+    ]
+
+
+def worst_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> Table:
+    """The blocks with the lowest predictive density for each second."""
+    table = [["clip", "from", "to", "log predictive density per s", "Pareto k"]]
+    seconds = np.maximum(blocks.end - blocks.start, 1e-9)
+    for i in np.argsort(found.elpd_of_block / seconds)[:SHOWN]:
+        mark = "" if found.pareto_k[i] <= found.max_k else "!"
+        table.append(
+            [
+                str(blocks.clip[i]),
+                f"{blocks.start[i]:.1f} s",
+                f"{blocks.end[i]:.1f} s",
+                f"{found.elpd_of_block[i] / seconds[i]:.1f}",
+                f"{found.pareto_k[i]:.2f}{mark}",
+            ]
+        )
+    return table
+
+
+def predictive_sentence(checks: Sequence[PredictiveCheck]) -> str:
+    """Whether the capture is like the replicates, and where not."""
+    several = len({check.clip for check in checks}) > 1
+    unlike = [
+        f"{RESIDUALS[check.kind].name.lower()}{f' of clip {check.clip + 1}' if several else ''} "
+        f"({', '.join(check.surprises)})"
+        for check in checks
+        if check.surprises
+    ]
+    if not unlike:
+        return "The captured motion is like the posterior's replicates of it."
+    return f"The captured motion is unlike the posterior's replicates: {'; '.join(unlike)}."
+
+
+def predictive_section(replay: Replay) -> list[str]:
+    """Paragraphs of Markdown."""
+    count = len(replay.checks[0].rms.replicated) if replay.checks else 0
+    return [
+        "### The capture beside replicates",
+        predictive_sentence(replay.checks),
+        f"{count} draws of the posterior move the clip again, each with noise of its own from the "
+        "model in force. Residuals are those from the draw's own motion, in sigmas: of the capture "
+        "the median over the draws, of the replicates 95 %. p is how often a replicate's figure is "
+        f"the larger one; an exclamation mark stands where it is below {SURPRISING:g} or above "
+        f"{1 - SURPRISING:g}. About 5 % of the frames should be outside the band of the replicates "
+        "that the picture shows.",
+        markdown(check_table(replay.checks, replay.bands)),
+    ]
+
+
+def check_table(checks: Sequence[PredictiveCheck], bands: Sequence[Band]) -> Table:
+    """One row for each kind of residual and clip."""
+    table = [["clip", "residuals", "rms", "replicates", "p", "autocorrelation", "replicates", "p"]]
+    table[0] += ["largest", "replicates", "p", "outside the band"]
+    for check, band in zip(checks, bands, strict=True):
+        cells = [str(check.clip + 1), RESIDUALS[check.kind].name]
+        for statistic in (check.rms, check.autocorrelation, check.largest):
+            cells += _cells(statistic)
+        table.append([*cells, percent(band.outside)])
+    return table
+
+
+def _cells(statistic: Statistic) -> list[str]:
+    low, high = statistic.replicated_interval
+    mark = "!" if statistic.is_surprising else ""
+    return [f"{statistic.median:.3g}", f"{low:.3g} to {high:.3g}", f"{statistic.p:.3f}{mark}"]

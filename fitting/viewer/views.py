@@ -1,0 +1,177 @@
+"""Jobs that show a page in the browser: a run, a clip, or a fit while it goes on."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jaxik
+from fitting import viewer
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.problems import ClipData
+from fitting.inference.optimise.solution import Progress, Report
+from fitting.problem.capture_system import alone
+from fitting.problem.problem import Problem
+from fitting.runtime import activity
+from fitting.studies.output import Log, silent
+
+EXTRA = 'needs viser: pip install "jaxik[view]"'
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+BEST = "best so far"
+EVERY = 0.5  # s, at least, between two points of a fit that are shown
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the page is served."""
+
+    host: str = LOOPBACK[0]
+    port: int = 8080
+    """The next free one is taken where this is in use; 0 for any."""
+
+
+@contextmanager
+def opened(
+    subject: viewer.Subject, folder: Path, address: Address = Address(), log: Log = silent
+) -> Iterator[Any]:
+    """A `fitting.viewer.page.Viewer` while it is open.
+
+    Args:
+        subject: what is viewed.
+        folder: where Save writes.
+        address: of the page.
+        log: called with where to find it.
+
+    Raises:
+        ValueError: viser is not installed, or the address or the folder does not exist.
+    """
+    check_folder(folder)
+    page = _page()
+    with ExitStack() as stack:
+        server = page.open_server(
+            address.host, address.port, "jaxik view", own_pages_only=address.host in LOOPBACK
+        )
+        stack.callback(page.stop, server)
+        with activity.announced("Preparing the page"):
+            shown = page.Viewer(server, subject, folder)
+        stack.callback(shown.close)
+        log(f"{subject.title}: open {page.address(server)} in a browser")
+        if address.host not in LOOPBACK:
+            log(f"note: whoever reaches {address.host} can move sliders, and save into {folder}")
+        yield shown
+
+
+def view(
+    subject: viewer.Subject,
+    folder: str | Path,
+    address: Address = Address(),
+    *,
+    log: Log = silent,
+    until: threading.Event | None = None,
+) -> None:
+    """Shows a page until an event is set, or for ever; KeyboardInterrupt (Ctrl-C) ends it.
+
+    Raises:
+        ValueError: as `opened`.
+    """
+    event = until or threading.Event()
+    try:
+        with opened(subject, Path(folder), address, log):
+            while not event.wait(0.5):
+                pass
+    except KeyboardInterrupt:
+        log("")
+
+
+def view_run(
+    run: str | Path, folder: str | Path | None, address: Address = Address(), *, log: Log = silent
+) -> None:
+    """Shows the clips of a run; Save writes into its folder, unless another one is named.
+
+    Raises:
+        ValueError: as `opened`, or the folder holds no finished fit.
+    """
+    if folder is not None:
+        check_folder(Path(folder))
+    view(viewer.subject_of_run(Path(run)), folder or run, address, log=log)
+
+
+def check_folder(folder: Path) -> None:
+    """Checks, before anything is computed, that Save can write.
+
+    Raises:
+        ValueError: viser is not installed, or there is no such folder.
+    """
+    _page()
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder, in which to save; make it, or name another")
+
+
+@dataclass
+class FitWatch:
+    """Shows the best point of a fit on a page while the search goes on.
+
+    Args:
+        folder: of the run, where Save writes.
+        address: of the page.
+        progress: called with every report, too.
+        log: called with where to find the page.
+    """
+
+    folder: Path
+    address: Address
+    progress: Callable[[Progress], None]
+    log: Log = silent
+    viewer: Any = field(default=None, repr=False)
+    """The `fitting.viewer.page.Viewer`, once there is one."""
+    _page: ExitStack = field(default_factory=ExitStack, repr=False)
+    _problem: Problem[jaxik.FootIK] | None = field(default=None, repr=False)
+    _shown: tuple[float, float] = (float("inf"), float("-inf"))  # cost, and when it was shown
+
+    def __enter__(self) -> "FitWatch":
+        _page()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._page.close()
+
+    def load(
+        self, experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
+    ) -> None:
+        """Opens the page, once the clips are loaded."""
+        subject = viewer.subject_of_fit(experiment, problem, clips)
+        self._problem = problem
+        page = opened(subject, self.folder, self.address, self.log)
+        self.viewer = self._page.enter_context(page)
+
+    def __call__(self, progress: Progress) -> None:
+        """Shows the best point where it is another than the one shown, now and then."""
+        self.progress(progress)
+        cost, when = self._shown
+        now = time.monotonic()
+        if not isinstance(progress, Report) or self._problem is None:
+            return
+        if progress.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
+            self._shown = (progress.best, now)
+            ik = alone(self._problem.space.unpack(progress.best_u))
+            note = f"The fit goes on: {progress.stage}, best cost {progress.best:.6g}."
+            self.viewer.restart(BEST, ik, note)
+
+
+def _page() -> ModuleType:
+    """The modules of the page.
+
+    Raises:
+        ValueError: viser is not installed.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError:
+        raise ValueError(EXTRA) from None
+    from . import page
+
+    return page
