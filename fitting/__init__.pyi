@@ -34,7 +34,7 @@ from .jobs import sample as sample
 from .jobs import translate as translate
 from .motion.flat_animation import load_flat_animation as load_flat_animation
 from .runtime.xla import configure_xla as configure_xla
-from .studies.animations.animations import AnimationFiles as AnimationFiles
+from .studies.animations import AnimationFiles as AnimationFiles
 from .studies.fit.fit import Fit as Fit
 from .studies.many.evaluation import evaluate_many as evaluate_many
 from .studies.many.evaluation import vary as vary

@@ -19,13 +19,13 @@ parameters for others: `export`. `examples` copies the experiments that come wit
 """
 
 from .studies.ablation import ablate as ablate
-from .studies.animations.animation_jobs import apply as apply
-from .studies.animations.animation_jobs import compare as compare
-from .studies.animations.animation_jobs import run_suite as run_suite
-from .studies.animations.animation_jobs import solve as solve
+from .studies.animation_jobs import apply as apply
+from .studies.animation_jobs import compare as compare
+from .studies.animation_jobs import run_suite as run_suite
+from .studies.animation_jobs import solve as solve
 from .studies.calibrate.calibration_jobs import calibrate as calibrate
 from .studies.calibrate.calibration_jobs import calibrate_wrong_model as calibrate_wrong_model
-from .studies.drafts.draft_report import init as init
+from .studies.draft_report import init as init
 from .studies.exports import export as export
 from .studies.fit.fit_jobs import fit as fit
 from .studies.fit.fit_jobs import sample as sample

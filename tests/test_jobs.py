@@ -411,7 +411,7 @@ def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
     assert len(chain_of(run)) == 100
 
 
-@pytest.mark.filterwarnings("ignore::fitting.studies.animations.placement_report.PlacementWarning")
+@pytest.mark.filterwarnings("ignore::fitting.studies.animations.PlacementWarning")
 def test_apply_runs_the_fitted_system_on_another_clip(done, animation, tmp_path, capsys):
     out = tmp_path / "out.npz"
     words = [done.run, animation.clip, "--terrain", animation.terrain, "-o", out]

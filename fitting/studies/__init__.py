@@ -1,8 +1,8 @@
 """The studies, each with its computing, its report and its job: deleting its place deletes it.
 
-A fit (`fit`), its posterior (`sample`), a first experiment (`drafts`), ablations (`ablation`),
+A fit (`fit`), its posterior (`sample`), a first experiment (`draft`), ablations (`ablation`),
 calibrations (`calibrate`), clips of several subjects (`population`), many fits at once (`many`), a
-finished system on clips (`animations`), several systems on one clip (`compare`) or in made
+finished system on clips (`animations`), several systems on one clip (`comparison`) or in made
 situations (`suite`), translations between systems (`translation`), and reconstructed ground
 (`terrain_report`). `output` is what the folders of all have in common, `notebook` what notebooks
 show, `exports` what other programs read.

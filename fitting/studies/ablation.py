@@ -58,7 +58,7 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
-from .animations.animations import Animation
+from .animations import Animation
 from .fit.assess import search_with_noise
 from .fit.sentences import listed
 from .output import Log, log_output, output_folder, silent

@@ -14,8 +14,8 @@ from fitting.report.formatting import Table, interval, number, transposed
 from fitting.runtime import display
 from jaxik.maths import parameter_tree
 
-from .compare import comparison_report
-from .compare.comparison import Comparison
+from . import comparison_report
+from .comparison import Comparison
 from .fit import fit_plots, fit_tables
 from .fit.fit import Fit
 from .sample import posterior_plots, posterior_report

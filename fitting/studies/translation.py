@@ -56,7 +56,7 @@ from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 
-from .animations.animations import AnimationFiles, load_animation
+from .animations import AnimationFiles, load_animation
 from .fit import fit_report, run_folder
 from .fit.fit import Fit
 

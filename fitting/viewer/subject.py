@@ -31,7 +31,7 @@ from fitting.problem.scene import Scene
 from fitting.problem.space import FreeParameter, Vector
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.program_cache import cached
-from fitting.studies.animations.animations import AnimationFiles, load_animation
+from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations

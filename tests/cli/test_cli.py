@@ -32,7 +32,7 @@ from fitting.ground.meshes import load_terrain, mesh_of, save_mesh
 from fitting.inference.optimise.solution import Progress
 from fitting.runtime import activity
 from fitting.studies import exports
-from fitting.studies.animations.animations import AnimationFiles
+from fitting.studies.animations import AnimationFiles
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from support import gltf_files, grounds
@@ -46,7 +46,7 @@ BASE, GROUND = DATA / "clips" / "uneven_walk_base.npz", DATA / "terrains" / "slo
 FILES = {"DATA": DATA, "BASE": BASE, "GROUND": GROUND}
 pytestmark = pytest.mark.filterwarnings(
     "ignore::fitting.ground.coverage.GroundWarning",
-    "always::fitting.studies.animations.placement_report.PlacementWarning",
+    "always::fitting.studies.animations.PlacementWarning",
 )
 
 

@@ -13,8 +13,8 @@ import jaxik
 from fitting.clips import Clip, clip_frames, contacts
 from fitting.ground.ground_path import place_root
 from fitting.motion.flat_animation import with_cut_off_swings
-from fitting.studies.animations import placement_report
-from fitting.studies.animations.animations import Animation
+from fitting.studies import animations
+from fitting.studies.animations import Animation
 from fitting.synthetic import footsteps, walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
@@ -124,7 +124,7 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
         np.testing.assert_allclose(leant.positions_ws[:, joint], expected, atol=1e-12)
     crown, before = (c.positions_ws[:, 13] - c.positions_ws[:, 12] for c in (leant, plain))
     np.testing.assert_allclose(crown, before, atol=1e-12)  # the head turned back
-    text = placement_report.trunk_text(leaning, taller)
+    text = animations.trunk_text(leaning, taller)
     most = np.degrees(bend.magnitude().max())
     assert text == f"spine: leans by up to {most:.1f}°, applied to spine; head turns back"
     legs_only = clip_frames.clip_from_result(clip, leaning)

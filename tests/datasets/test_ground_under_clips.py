@@ -17,7 +17,7 @@ from fitting.ground.coverage import GroundWarning
 from fitting.ground.meshes import AS_IS, TerrainOptions, load_terrain, save_mesh
 from fitting.motion import flat_animation
 from fitting.motion.flat_animation import flatten_clip, load_flat_animation, with_rigid_legs
-from fitting.studies.animations.animations import AnimationFiles, load_animation
+from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.synthetic import footsteps, walker
 from jaxik.world import terrain
 from support import bodies, experiments
@@ -261,7 +261,8 @@ def test_feet_keep_their_rotation_against_slopes_and_not_against_the_sides_of_st
         away = (ankles - balls)[walk.stance]
         offset = np.broadcast_to(expected @ [0.0, 0.05, -0.1], away.shape)
         np.testing.assert_allclose(away, offset, atol=1e-9)
-    first, last = next(run for run in runs(~walk.stance[:, 0]) if run[0] > 0)
+    swings = runs(~walk.stance_labels()[:, 0])
+    first, last = next(swing for swing in swings if swing[0] > 0)
     foot = flattened(SLOPE).rotations_ws[first : last + 1, walk.rig.joints[0][2]]
     back = (lying.inv() * Rotation.from_quat(foot, scalar_first=True)).magnitude()
     assert back[len(back) // 2] < 0.02 < 0.19 < back[0] and back[-1] > 0.19

@@ -20,9 +20,8 @@ from fitting.experiment.problems import load_clip_data, make_problem
 from fitting.experiment.systems import Preset
 from fitting.motion import playback
 from fitting.problem.scene import legs_ws, pelvis_ws
-from fitting.studies import ablation
-from fitting.studies.animations import animation_jobs
-from fitting.studies.animations.animations import AnimationFiles
+from fitting.studies import ablation, animation_jobs
+from fitting.studies.animations import AnimationFiles
 from fitting.studies.fit import fit_jobs, record_price
 from fitting.studies.fit.fit import Fit
 from jaxik import presets, record

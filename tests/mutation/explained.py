@@ -57,7 +57,7 @@ REASONS = {
         for number in (99, 101)
     ],
     "fitting/viewer/solving.py": [("(230, 159, 0)", "", LOOK)],
-    "fitting/studies/drafts/draft.py": [
+    "fitting/studies/draft.py": [
         ("rig = data[0]", "rig = data[ -1]", "either clip has a body to start from")
     ],
     "fitting/studies/calibrate/replicates.py": [

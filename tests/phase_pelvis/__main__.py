@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.clips.clip_frames import positions_by_role
 from fitting.experiment import systems
-from fitting.studies.animations.animations import Animation, AnimationFiles, load_animation
+from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from jaxik.maths import parameter_tree
 
 UP = np.array([0.0, 1.0, 0.0])

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from fitting.report import pages
-from fitting.studies.compare import comparison_report
+from fitting.studies import comparison_report
 from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
 from support import comparisons, runs

@@ -24,8 +24,7 @@ from fitting.problem.scene import legs_ws
 from fitting.report import formatting, motion_data, pages
 from fitting.report.pages import Finding, Grid, Section, StudyPage, Text
 from fitting.report.style import save
-from fitting.studies.animations import placement_report
-from fitting.studies.compare import comparison, comparison_report
+from fitting.studies import animations, comparison, comparison_report
 from fitting.studies.fit import fit_motions, fit_page, fit_plots, identifiability_report, sentences
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import posterior_report, run_comparison
@@ -79,7 +78,7 @@ UNKNOWN = Placement(NAN, NAN, NAN, NAN, 1.0, NOTHING, NOTHING, NAN, NOTHING, NOT
 
 
 def test_the_table_says_how_often_how_far_and_where_and_what_is_unknown_is_null_in_json():
-    heading, _, *rows = placement_report.text(GOOD).splitlines()
+    heading, _, *rows = animations.text(GOOD).splitlines()
     assert heading == "feet and ground, 2 cm or more   frames  largest"
     assert rows == [
         "standing feet in the ground     1.0 %   3.1 cm, left, frame 7",
@@ -90,11 +89,11 @@ def test_the_table_says_how_often_how_far_and_where_and_what_is_unknown_is_null_
         "slide in a stance, median       1.1 cm  4.4 cm, left, frame 9",
         "pop in 1/60 s                           3.3 cm, right, frame 10",
     ]
-    assert "nan" not in placement_report.text(UNKNOWN)
-    numbers = json.loads(json.dumps(placement_report.numbers(UNKNOWN)))
+    assert "nan" not in animations.text(UNKNOWN)
+    numbers = json.loads(json.dumps(animations.numbers(UNKNOWN)))
     assert numbers["sunk"] is None and numbers["groundless"] == 1.0
     assert numbers["deepest"] == {"value": None, "frame": 0, "leg": "left"}
-    assert placement_report.numbers(GOOD)["pop"]["value"] == pytest.approx(0.033)
+    assert animations.numbers(GOOD)["pop"]["value"] == pytest.approx(0.033)
 
 
 def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cause():
@@ -109,23 +108,23 @@ def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cau
         (Cause("missing"), "the terrain does not lie below the whole path"),
         (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
     ):
-        (text,) = placement_report.warning_texts(sunk, cause)
+        (text,) = animations.warning_texts(sunk, cause)
         assert "in the ground in 62.0 % of their frames (deepest: 3.1 cm, left, frame 7)" in text
         assert "above it in 2.0 % (highest: 2.2 cm, right, frame 8)" in text
         assert f"likely cause: {words}" in text
-    assert placement_report.warning_texts(GOOD, None) == []
-    (text,) = placement_report.warning_texts(UNKNOWN, Cause("missing"))
+    assert animations.warning_texts(GOOD, None) == []
+    (text,) = animations.warning_texts(UNKNOWN, Cause("missing"))
     assert text.startswith("there is no ground under 100.0 % of the soles; likely cause: ")
     unlabelled = dataclasses.replace(GOOD, sunk=NAN, floating=NAN, slide=NAN)
-    (text,) = placement_report.warning_texts(unlabelled, None)
+    (text,) = animations.warning_texts(unlabelled, None)
     assert text.startswith("no foot of the animation ever stands; see ")
     bad = dataclasses.replace(GOOD, slide=0.05, pop=Extreme(0.124, 3, "left"))
-    assert placement_report.warning_texts(bad, None) == [
+    assert animations.warning_texts(bad, None) == [
         "standing feet slide by 5.0 cm a stance more than animated (most: 4.4 cm, left, frame 9)",
         "feet pop in 1/60 s (most: 12.4 cm, left, frame 3)",
     ]
-    with pytest.warns(placement_report.PlacementWarning, match="^mec: feet pop in 1/60 s"):
-        placement_report.warn(dataclasses.replace(bad, slide=0.0), None, "mec")
+    with pytest.warns(animations.PlacementWarning, match="^mec: feet pop in 1/60 s"):
+        animations.warn(dataclasses.replace(bad, slide=0.0), None, "mec")
 
 
 # The worst two seconds

@@ -7,7 +7,7 @@ import jaxik
 from fitting.clips import clip_frames
 from fitting.ground import meshes
 from fitting.motion import flat_animation
-from fitting.studies.animations.animations import Animation
+from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
 from support.benchmark import scoring_program
 

@@ -10,7 +10,7 @@ import jaxik
 from fitting.experiment import experiment_files, parameter_files, problems, systems
 from fitting.experiment.file_tables import Ablation
 from fitting.studies import translation
-from fitting.studies.animations.animations import Animation, AnimationFiles
+from fitting.studies.animations import Animation, AnimationFiles
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, leg, pelvis

@@ -21,7 +21,7 @@ from fitting.ground.ground_path import AS_ANIMATED, place_root
 from fitting.ground.meshes import save_mesh
 from fitting.motion import measures
 from fitting.runtime import program_cache
-from fitting.studies.animations.animations import Animation
+from fitting.studies.animations import Animation
 from fitting.synthetic import walker
 from jaxik import presets
 from jaxik.maths import parameter_tree

@@ -23,9 +23,8 @@ from fitting.motion.measures import Measures
 from fitting.motion.playback import Motion
 from fitting.report import pages, style
 from fitting.report.formatting import MEASURES
-from fitting.studies.animations import animations
-from fitting.studies.animations.animations import Animation, every_frame, measure
-from fitting.studies.compare import comparison, comparison_report
+from fitting.studies import animations, comparison, comparison_report
+from fitting.studies.animations import Animation, every_frame, measure
 from fitting.synthetic import walker
 from fitting.synthetic.walker import WalkStyle
 from jaxik.maths import parameter_tree
@@ -35,9 +34,7 @@ from support.commands import refusal
 from support.experiments import ROOT
 from support.pages import Page
 
-pytestmark = pytest.mark.filterwarnings(
-    "always::fitting.studies.animations.placement_report.PlacementWarning"
-)
+pytestmark = pytest.mark.filterwarnings("always::fitting.studies.animations.PlacementWarning")
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"

@@ -23,8 +23,8 @@ from fitting.experiment.systems import Preset
 from fitting.inference import sensitivity
 from fitting.inference.noise import NoiseOptions
 from fitting.problem.space import SPREAD, free_parameter, make_space
-from fitting.studies.drafts import draft
-from fitting.studies.drafts.draft import DraftRequest
+from fitting.studies import draft
+from fitting.studies.draft import DraftRequest
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import ROOT, write

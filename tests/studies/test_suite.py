@@ -14,9 +14,9 @@ from fitting.cli import main
 from fitting.experiment.systems import preset_names, preset_system
 from fitting.motion.measures import Extreme
 from fitting.runtime.precision import in_float64
-from fitting.studies.suite import suite, suite_report
-from fitting.studies.suite import suite as suite_suite
-from fitting.studies.suite.suite import Cell, Suite, run_suite
+from fitting.studies import suite, suite_report
+from fitting.studies import suite as suite_suite
+from fitting.studies.suite import Cell, Suite, run_suite
 from fitting.synthetic import footsteps
 from jaxik.maths import parameter_tree
 

@@ -27,7 +27,7 @@ from fitting.motion.flat_animation import load_flat_animation
 from fitting.motion.playback import ClipActivity
 from fitting.report.formatting import DIFFERENCES
 from fitting.studies import translation
-from fitting.studies.animations.animations import Animation
+from fitting.studies.animations import Animation
 from fitting.studies.fit import fit_jobs, fit_report, run_folder
 from jaxik import presets
 from jaxik.maths import parameter_tree

@@ -10,9 +10,9 @@ from fitting.ground.meshes import load_terrain
 from fitting.motion.flat_animation import load_flat_animation
 from fitting.motion.measures import Measures
 from fitting.report.formatting import MEASURES
-from fitting.studies.animations.animations import Animation
-from fitting.studies.compare import comparison
-from fitting.studies.compare.comparison import ANIMATED, Comparison
+from fitting.studies import comparison
+from fitting.studies.animations import Animation
+from fitting.studies.comparison import ANIMATED, Comparison
 
 from .experiments import ROOT
 

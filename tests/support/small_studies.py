@@ -11,7 +11,7 @@ from pytest import MonkeyPatch
 
 from fitting.experiment import problems
 from fitting.studies import ablation
-from fitting.studies.animations.animations import Animation
+from fitting.studies.animations import Animation
 from fitting.studies.calibrate import replicates
 from fitting.studies.population import population, population_report
 from jaxik.maths import parameter_tree

@@ -16,7 +16,7 @@ from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress, Report
 from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Soles
 from fitting.problem.space import free_parameter
-from fitting.studies.animations.animations import AnimationFiles, load_animation
+from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.fit.fit_motions import saved_clips
 from fitting.viewer import Solver, solving, tuning, views
 from fitting.viewer.page import Latest

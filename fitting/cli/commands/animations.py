@@ -10,9 +10,9 @@ from fitting.experiment import parameter_files, systems
 from fitting.experiment.systems import Preset
 from fitting.runtime import activity, cache_folder
 from fitting.runtime.precision import in_float64
-from fitting.studies.animations.animations import AnimationFiles
-from fitting.studies.compare import comparison
-from fitting.studies.suite import suite as suite_suite
+from fitting.studies import comparison
+from fitting.studies import suite as suite_suite
+from fitting.studies.animations import AnimationFiles
 from fitting.viewer.views import Address, check_folder
 from jaxik import FootIK, Rig
 

@@ -12,8 +12,8 @@ from fitting.experiment.systems import Preset
 from fitting.runtime import cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
-from fitting.studies.animations.animations import AnimationFiles
-from fitting.studies.drafts.draft import DraftRequest
+from fitting.studies.animations import AnimationFiles
+from fitting.studies.draft import DraftRequest
 from fitting.studies.translation import TranslationRequest
 from fitting.viewer.views import Address, FitWatch
 

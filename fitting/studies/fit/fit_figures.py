@@ -8,7 +8,7 @@ from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import Placement
 from fitting.motion.playback import ClipActivity
 from fitting.report.formatting import ACCURACY, Table, headings, interval, number
-from fitting.studies.animations import placement_report
+from fitting.studies import animations
 
 from . import fit_tables
 from .fit import FittedParameter
@@ -111,7 +111,7 @@ def accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
 
 def placement_table(placements: Mapping[str, Placement]) -> Table:
     """How the feet of motions are placed on the ground; a column for each, by name."""
-    tables = [placement_report.table(placement) for placement in placements.values()]
+    tables = [animations.table(placement) for placement in placements.values()]
     table = [[tables[0][0][0], *placements]]
     for rows in zip(*(table[1:] for table in tables), strict=True):
         cells = [" · ".join(filter(None, (share, place))) for _, share, place in rows]

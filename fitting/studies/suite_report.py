@@ -29,10 +29,10 @@ from fitting.report.style import BEFORE, EARTH, GROUND, STAGES, earth, legend, s
 from fitting.runtime import files
 from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64
-from fitting.studies.animations.placement_report import numbers as placement_numbers
-from fitting.studies.compare import comparison, comparison_report
-from fitting.studies.fit.sentences import listed
 
+from . import comparison, comparison_report
+from .animations import numbers as placement_numbers
+from .fit.sentences import listed
 from .suite import REASONS, Cell, Outcome, Scene, Suite
 
 TABLE, NUMBERS, PAGE = "suite.md", "suite.json", "suite.png"

@@ -59,13 +59,13 @@ from fitting.report.style import (
 from fitting.runtime import files
 from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64
-from fitting.studies.animations.animations import JOINTS
-from fitting.studies.fit import fit_figures
-from fitting.studies.fit.sentences import listed
 
 from . import comparison as compare_comparison
+from .animations import JOINTS
 from .comparison import ANIMATED, ComparedMotions, Comparison
 from .comparison import ANIMATED as ANIMATION
+from .fit import fit_figures
+from .fit.sentences import listed
 
 TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
 

@@ -14,11 +14,9 @@ from fitting.report.formatting import aligned, bullets, joined
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
-from fitting.studies import terrain_report
-from fitting.studies.fit import goodness_report
-from fitting.studies.output import Log, output_folder, silent
 from jaxik.world.body import scaled_declarations
 
+from . import terrain_report
 from .draft import (
     EXPERIMENT,
     Draft,
@@ -28,6 +26,8 @@ from .draft import (
     draft,
     reconstruct_grounds,
 )
+from .fit import goodness_report
+from .output import Log, output_folder, silent
 
 AS_IT_COMES = "{} as it comes, for this body, without any fit:"
 NOTHING_FREE = "free: nothing; a fit writes these parameters and judges them, in seconds"

@@ -31,9 +31,10 @@ from fitting.motion.goodness import Distances, describe_setback
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from fitting.studies.fit import capture_check
-from fitting.studies.fit.capture_check import CaptureCheck, stances_of
 from jaxik.world import body
+
+from .fit import capture_check
+from .fit.capture_check import CaptureCheck, stances_of
 
 FEW_STANCES = 6  # of a foot
 SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together

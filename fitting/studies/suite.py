@@ -24,10 +24,11 @@ from fitting.motion.measures import (
     Placement,
     Soles,
 )
-from fitting.studies.animations.animations import Animation
 from fitting.synthetic import actions, walker
 from fitting.synthetic.footsteps import smoothstep
 from jaxik.world.terrain import Terrain, heightfield
+
+from .animations import Animation
 
 FLAT_SLIDE = 0.002  # m
 POP = 0.01  # m in 1/60 s

@@ -35,11 +35,12 @@ from fitting.runtime import activity
 from fitting.runtime.display import Shown, data_frame
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from fitting.studies.animations.animations import Animation, RateDifference
-from fitting.studies.fit.run_folder import PARAMETERS
-from fitting.studies.suite.suite import Scene
 from jaxik.maths import vec
 from jaxik.world.terrain import Terrain, cast
+
+from .animations import Animation, RateDifference
+from .fit.run_folder import PARAMETERS
+from .suite import Scene
 
 if TYPE_CHECKING:
     import pandas

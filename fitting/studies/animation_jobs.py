@@ -16,15 +16,13 @@ from fitting.motion import accuracy
 from fitting.report.formatting import aligned, joined, transposed
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64, with_floats
-from fitting.studies.compare import comparison, comparison_report
-from fitting.studies.compare.comparison import Comparison
-from fitting.studies.fit import fit_tables, run_folder
-from fitting.studies.output import Log, log_output, output_folder, silent
-from fitting.studies.suite import suite, suite_report
-from fitting.studies.suite.suite import Plan, Suite, SystemsOf
 
-from . import animations, placement_report
+from . import animations, comparison, comparison_report, suite, suite_report
 from .animations import AnimationFiles, load_animation
+from .comparison import Comparison
+from .fit import fit_tables, run_folder
+from .output import Log, log_output, output_folder, silent
+from .suite import Plan, Suite, SystemsOf
 
 
 @in_float64
@@ -70,7 +68,7 @@ def compare(
             log(joined(["", aligned(comparison_report.rate_table(compared))]))
         log_output(log, folder, comparison_report.TABLE)
         for name, (placement, cause) in compared.placements.items():
-            placement_report.warn(placement, cause, name)
+            animations.warn(placement, cause, name)
         return compared
 
 
@@ -90,7 +88,7 @@ def run_suite(
 
     Args:
         systems_of: makes systems for the body of a rig, by name.
-        plan: which situations; see `studies.suite.suite.choose`.
+        plan: which situations; see `fitting.studies.suite.choose`.
         output: folder for the table, the numbers, the pictures and the page.
         during: makes a context for each situation, from its name.
         log: called with what the command line prints.
@@ -170,19 +168,19 @@ def solve(
     with activity.announced("Measuring how the feet are placed"):
         placement, cause = loaded.assess(solved)
     if path is not None:
-        joints = placement_report.arrays(solved, placement)
+        joints = animations.arrays(solved, placement)
         ground = mesh_of(loaded.terrain) if with_terrain else None
         save_clip(path, solved, joints=joints, ground=ground)
-    log(placement_report.solved_text(loaded.reached(result), seconds, path))
+    log(animations.solved_text(loaded.reached(result), seconds, path))
     where = [
         f"root: {loaded.root.reason}",
         flight.describe(loaded.clip),
-        placement_report.trunk_text(result, solved),
+        animations.trunk_text(result, solved),
         *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
-    log(joined([*filter(None, where), "", placement_report.text(placement)]))
+    log(joined([*filter(None, where), "", animations.text(placement)]))
     if loaded.captured is not None:
         errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
         log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
-    placement_report.warn(placement, cause)
+    animations.warn(placement, cause)
     return solved

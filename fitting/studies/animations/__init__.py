@@ -1,1 +1,0 @@
-"""A finished system on clips: the solved motion, at several frame rates, and how it stands."""
