@@ -74,7 +74,9 @@ def two_bone(legs: Legs, limits: KneeLimits) -> tuple[Rotations, Rotations]:
     start = limits.soften * longest
     room = longest - start
     beyond = np.maximum(distance - start, 0.0)
-    soft = np.minimum(distance, start) + room * (1.0 - np.exp(-beyond / room))
+    soft = np.minimum(distance, start)
+    if limits.soften < 1:
+        soft += room * (1.0 - np.exp(-beyond / room))
     reach = np.clip(soft, shortest, longest)
 
     along_hip, along_ankle = np.sum(to_hip * hinge, -1), np.sum(to_ankle * hinge, -1)

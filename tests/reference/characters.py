@@ -38,7 +38,7 @@ DEFAULTS = (
     | named("pelvis", limit=0.30, on_gain=0.225, off_gain=0.116, tick_hz=30.0)
     | named("pelvis", vertical_only=True, wait_to_rise=False)
     | named("leg", max_knee_angle=math.acos(-0.990), min_knee_angle=math.acos(0.766))
-    | named("leg", soften=0.98, twist=0.0, weight=1.0, as_animated=False)
+    | named("leg", soften=1.0, twist=0.0, weight=1.0, as_animated=False)
     | named("foot", max_pitch=0.52, min_pitch=-0.79, max_roll=0.26, min_roll=-0.52)
 )
 

@@ -40,6 +40,7 @@ LATE = tilted((0, 0, 0), (0.5, 0, -1.2))  # begins to rise where "goes forward" 
 HOVERS = functools.partial(Case, ground=tilted((0.2, 0, 0)), clip="hovering")
 WALKS = functools.partial(Case, clip="goes forward")
 DRIFTS = functools.partial(Case, clip="drifts")
+SOFT = {"leg.soften": 0.98}
 BENDS = {"leg.as_animated": False, "effector.max_lift": 0.0}
 WIDE = {"probe.way_slope": 0.5}  # ground beside an edge counts
 # A root that stands while the feet walk.
@@ -141,7 +142,9 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("leg.soften", (0.85, 0.95), "+ knee angle", BELOW, STIFF),
         Case("leg.twist", (0.0, 0.2), "- knee left"),
         Case("leg.weight", (0.3, 0.8), "- miss", tilted((0, 0, 0.1)), STIFF),
-        Case("leg.as_animated", (False, True), "+ knee angle", clip="walks"),
+        Case(
+            "leg.as_animated", (False, True), "+ knee angle", tilted((0, 0, 0)), SOFT, clip="walks"
+        ),
     ),
     "stride": (
         *TARGETS,
