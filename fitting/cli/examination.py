@@ -24,7 +24,7 @@ from . import jax_start
 from .terminal import show
 
 LONGEST = 300.0  # s, for what needs JAX; it takes half a minute on two slow cores
-WITH_JAX = "fitting.cli.self_test"
+WITH_JAX = "fitting.cli.with_jax"
 
 
 PACKAGES = ("jaxik", "fitting")
@@ -139,11 +139,11 @@ def examine_installation() -> Iterator[Finding]:
     """Python, jaxik, the packages it needs, its extras, and what hides its name."""
     yield Finding("Python", f"{platform.python_version()}, {sys.executable}")
     try:
-        yield Finding("jaxik", f"{metadata.version('jaxik')}, {Path(__file__).parents[3]}")
+        yield Finding("jaxik", f"{metadata.version('jaxik')}, {Path(__file__).parents[2]}")
         requirements = [Requirement(text) for text in metadata.requires("jaxik") or ()]
     except metadata.PackageNotFoundError:
         problem = "jaxik is not installed, only its source is on the path"
-        yield Finding("jaxik", str(Path(__file__).parents[3]), problem, "pip install jaxik")
+        yield Finding("jaxik", str(Path(__file__).parents[2]), problem, "pip install jaxik")
         return
     needed = [requirement for requirement in requirements if requirement.marker is None]
     yield _packages("packages", needed, "pip install --upgrade jaxik")
@@ -216,7 +216,7 @@ def _names_in(folder: Path) -> Iterator[Finding]:
     """Files of a folder that hide our packages from Python scripts there."""
     for name in PACKAGES:
         spec = PathFinder.find_spec(name, [str(folder)])
-        installed = Path(__file__).parents[3] / name
+        installed = Path(__file__).parents[2] / name
         if spec is None or spec.origin is None or Path(spec.origin).parent == installed:
             continue
         problem = f"{spec.origin} hides the package {name} from Python that runs in this folder"

@@ -1,10 +1,7 @@
 """Half a minute of work whose outcome is known: a shipped clip that known parameters have made."""
 
 import dataclasses
-import sys
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +11,9 @@ from fitting.experiment.experiment import Experiment
 from fitting.inference.optimise import levenberg_marquardt
 from fitting.inference.optimise.levenberg_marquardt import HardModel, LMState
 from fitting.problem.problem import Problem
-from fitting.runtime import xla
 from fitting.runtime.precision import in_float64
 from fitting.studies import exports
 
-from . import jax_start
 from .examination import Finding
 
 EXAMPLE = "uneven_walk"
@@ -75,43 +70,3 @@ def _descend(problem: Problem, values: dict[str, float], steps: int) -> LMState:
     for _ in range(steps):
         state = levenberg_marquardt.step(model, state)
     return state
-
-
-def examine_jax(*, quick: bool) -> Iterator[Finding]:
-    """Everything; `quick` leaves the self-test out."""
-    try:
-        jax_start.start()
-    except jax_start.StartError as error:
-        yield Finding("JAX", "does not start", error.problem, error.remedy)
-        return
-    import jax
-
-    devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    yield Finding("devices", ", ".join(devices))
-    yield Finding("XLA flags", xla.describe_flags())
-    yield _kept_programs()
-    if not quick:
-        yield examine()
-
-
-def _kept_programs() -> Finding:
-    """Where programs are kept, and how many."""
-    from fitting.runtime import cache_folder
-
-    cache_folder.use_default()
-    folder = Path(str(cache_folder.setting(cache_folder.FOLDER) or cache_folder.default()))
-    kept = cache_folder.kept_programs(folder)
-    size = sum(path.stat().st_size for path in (*kept.traced, *kept.compiled)) / 1e6
-    fact = f"{len(kept.traced)} traced and {len(kept.compiled)} compiled, {size:.1f} MB, {folder}"
-    try:
-        cache_folder.traced()
-    except (cache_folder.SwitchedOffError, OSError) as error:
-        problem = f"programs are not kept, so that every command compiles anew: {error}"
-        remedy = "set XDG_CACHE_HOME to a folder of your own, and unset JAX's settings for a cache"
-        return Finding("programs", fact, problem, remedy)
-    return Finding("programs", fact)
-
-
-if __name__ == "__main__":
-    for finding in examine_jax(quick="--quick" in sys.argv):
-        print(finding.to_json(), flush=True)

@@ -64,7 +64,7 @@ def test_no_module_unpickles_or_runs_text(package):
             assert name not in ("eval", "exec", "compile", "os.system", "np.fromregex"), path
             assert "shell" not in keywords or name == "shtab.complete", path  # a kind of shell
             if name.endswith("pickle.loads"):  # between the processes of one call
-                assert path == house.ROOT / "fitting" / "runtime" / "parallel" / "cluster.py"
+                assert path == house.ROOT / "fitting" / "runtime" / "cluster.py"
             assert not name.endswith("pickle.load"), path
 
 

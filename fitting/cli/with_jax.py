@@ -1,0 +1,55 @@
+"""What needs JAX: devices, XLA flags, kept programs and the self-test.
+
+A process of its own, which prints a finding in each line: `python -m fitting.cli.with_jax`.
+"""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from fitting.cli import jax_start
+from fitting.runtime import xla
+
+from .examination import Finding
+
+
+def examine(*, quick: bool) -> Iterator[Finding]:
+    """Everything; `quick` leaves the self-test out."""
+    try:
+        jax_start.start()
+    except jax_start.StartError as error:
+        yield Finding("JAX", "does not start", error.problem, error.remedy)
+        return
+    import jax
+
+    devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    yield Finding("devices", ", ".join(devices))
+    yield Finding("XLA flags", xla.describe_flags())
+    yield _kept_programs()
+    if not quick:
+        from . import self_test
+
+        yield self_test.examine()
+
+
+def _kept_programs() -> Finding:
+    """Where programs are kept, and how many."""
+    from fitting.runtime import cache_folder
+
+    cache_folder.use_default()
+    folder = Path(str(cache_folder.setting(cache_folder.FOLDER) or cache_folder.default()))
+    kept = cache_folder.kept_programs(folder)
+    size = sum(path.stat().st_size for path in (*kept.traced, *kept.compiled)) / 1e6
+    fact = f"{len(kept.traced)} traced and {len(kept.compiled)} compiled, {size:.1f} MB, {folder}"
+    try:
+        cache_folder.traced()
+    except (cache_folder.SwitchedOffError, OSError) as error:
+        problem = f"programs are not kept, so that every command compiles anew: {error}"
+        remedy = "set XDG_CACHE_HOME to a folder of your own, and unset JAX's settings for a cache"
+        return Finding("programs", fact, problem, remedy)
+    return Finding("programs", fact)
+
+
+if __name__ == "__main__":
+    for finding in examine(quick="--quick" in sys.argv):
+        print(finding.to_json(), flush=True)
