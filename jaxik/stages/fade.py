@@ -22,7 +22,8 @@ from .effector import Effector
 from .inputs import SensedMoment
 
 BODY_SHARE = 0.5  # of the speed, that the body takes while legs fade too
-SETTLING = 1.0  # s after a change of weights in which pelvis rules may still go to new goals
+FADING = 0.1  # of a weight that is still to fade, from which the legs take their share of the speed
+SETTLED = 0.005  # m; a body that lags less has almost arrived
 SMALLEST = 1e-6  # m, smaller corrections fade at once
 
 
@@ -96,20 +97,18 @@ class NoFade(AbstractFade):
 class SpeedFadeState:
     """What has faded in so far."""
 
-    goal: Float[Array, " legs"]
-    """0..1, weights that the legs were to have."""
     weight: Float[Array, " legs"]
     """0..1, weights that they had."""
     body: Transform
     """Motion of the body: offset, m, and rotation, world axes."""
     moved: Float[Array, ""]
     """m, how far the body moved by itself in this frame."""
-    since: Float[Array, ""]
-    """s, since a weight changed or the body last was where it is to be."""
+    lag: Float[Array, ""]
+    """m, how far the body is from where it is to be."""
     hip_height: Float[Array, ""] = place("height")
     """m, along up, of the animated hips."""
     fall_speed: Float[Array, ""]
-    """m/s, at which the animated hips fell when foot IK was last off."""
+    """m/s, at which the animated hips fell while foot IK was off; until all has faded in."""
     speed: Float[Array, ""]
     """m/s, of the fade in this frame: what the animation has lost of that speed, at a landing."""
 
@@ -118,9 +117,10 @@ class SpeedFade(AbstractFade):
     """Fades by a speed: whatever jumps, no ankle, ball or pelvis moves faster because of it.
 
     A leg's weight moves in steps of `speed dt / size`, where `size` bounds how far ankle and ball
-    move between no and full foot IK. After a weight has changed, the body moves to where pelvis and
-    lean want it by at most the same speed until it is there, whatever their rules do. Weights that
-    stay as they are leave no trace.
+    move between no and full foot IK. While weights fade, the body may lag behind where pelvis and
+    lean want it, by a leg's length times the largest weight that is still to fade; this lag then
+    closes by the same speed. So a change of a weight by x holds the body back by at most x times
+    what a full one may, and weights that stay as they are leave no trace.
 
     A character that falls lands at the speed of its fall: its feet go on to the ground as animated,
     instead of waiting for the fade.
@@ -138,7 +138,7 @@ class SpeedFade(AbstractFade):
     def init(self, rig: Rig) -> SpeedFadeState:
         zero, zeros = jnp.zeros((), rig.side.dtype), jnp.zeros_like(rig.side)
         body = Transform(jnp.zeros(3, zero.dtype), quat.identity(zero.dtype))
-        return SpeedFadeState(zeros, zeros, body, zero, zero + SETTLING, zero, zero, zero)
+        return SpeedFadeState(zeros, body, zero, zero, zero, zero, zero)
 
     def lasting(self, weight: Array, state: SpeedFadeState) -> Array:
         return jnp.where(state.weight > weight, state.weight, weight)
@@ -146,29 +146,26 @@ class SpeedFade(AbstractFade):
     def body(
         self, now: SensedMoment, goal: Transform, weight: Array, state: SpeedFadeState
     ) -> tuple[SpeedFadeState, Transform]:
-        changed = now.started & jnp.any(weight != state.goal)
-        since = jnp.where(changed, 0.0, state.since + now.dt)
-        state = self._with_speed(now, weight, dataclasses.replace(state, since=since))
-        fading = jnp.any(weight != state.weight)
-        limit = state.speed * jnp.where(fading, BODY_SHARE, 1.0) * now.dt
         sensed = now.sensed
         lengths = jnp.where(sensed.present, sensed.thigh + sensed.shin, 0.0)
         reach = HARD.maximum(lengths, band=0.0)
+        unfaded = HARD.maximum(
+            jnp.where(sensed.present, jnp.abs(weight - state.weight), 0.0), band=0.0
+        )
+        state = self._with_speed(now, weight, unfaded, state)
+        legs_share = jnp.clip(unfaded / FADING, 0.0, 1.0)
+        limit = state.speed * (1.0 - (1.0 - BODY_SHARE) * legs_share) * now.dt
         offset = goal.pos - state.body.pos
         gap = vec.length(offset) + reach * quat.angle(state.body.rot, goal.rot)
-        limited = now.started & (since < SETTLING) & (gap > limit)
-        part = jnp.where(limited, limit / jnp.where(limited, gap, 1.0), 1.0)
+        most = jnp.where(now.started, jnp.maximum(reach * unfaded, state.lag - limit), 0.0)
+        lag = jnp.minimum(jnp.maximum(gap - limit, 0.0), most)
+        behind = lag > 0
+        part = 1.0 - jnp.where(behind, lag / jnp.where(behind, gap, 1.0), 0.0)
         body = Transform(
-            jnp.where(limited, state.body.pos + vec.scale(offset, part), goal.pos),
-            jnp.where(limited, quat.nlerp(state.body.rot, goal.rot, part), goal.rot),
+            jnp.where(behind, state.body.pos + vec.scale(offset, part), goal.pos),
+            jnp.where(behind, quat.nlerp(state.body.rot, goal.rot, part), goal.rot),
         )
-        after = dataclasses.replace(
-            state,
-            goal=weight,
-            body=body,
-            moved=jnp.where(gap > limit, limit, gap),
-            since=jnp.where(limited, 0.0, since),
-        )
+        after = dataclasses.replace(state, body=body, moved=jnp.minimum(gap, limit), lag=lag)
         return after, body
 
     def legs(
@@ -180,8 +177,8 @@ class SpeedFade(AbstractFade):
         state: SpeedFadeState,
     ) -> tuple[SpeedFadeState, Array]:
         # A foot that swings by its contact may join its animation as fast as that moves.
-        swinging = jnp.where(weight < now.sensed.weight, now.sensed.foot_speed, 0.0)
-        limit = (state.speed + swinging) * now.dt
+        swinging = jnp.clip((now.sensed.weight - weight) / FADING, 0.0, 1.0)
+        limit = (state.speed + swinging * now.sensed.foot_speed) * now.dt
         # A leg that has not faded in moves with the body.
         limit -= (1.0 - state.weight) * BODY_SHARE * state.moved
         size = correction_size(now, effector, body, state.weight)
@@ -191,15 +188,16 @@ class SpeedFade(AbstractFade):
         return dataclasses.replace(state, weight=faded), faded
 
     def _with_speed(
-        self, now: SensedMoment, weight: Array, state: SpeedFadeState
+        self, now: SensedMoment, weight: Array, unfaded: Array, state: SpeedFadeState
     ) -> SpeedFadeState:
         """The memory with how fast the hips fall, or fell before the landing."""
         sensed = now.sensed
         height = vec.dot(_mean_hip(sensed) - sensed.root_ws, sensed.up_ws)
         falling = jnp.where(now.started, vec.safe_divide(state.hip_height - height, now.dt), 0.0)
         falling = jnp.where(falling > 0, falling, 0.0)
-        landing = jnp.where(state.since < SETTLING, state.fall_speed, 0.0)
-        fall_speed = jnp.where(jnp.all(weight == 0), falling, landing)
+        landing = state.fall_speed * jnp.clip(unfaded / FADING + state.lag / SETTLED, 0.0, 1.0)
+        off = 1.0 - HARD.maximum(weight, band=0.0)
+        fall_speed = jnp.maximum(off * falling, landing)
         remaining = fall_speed - falling
         return dataclasses.replace(
             state,

@@ -12,7 +12,8 @@ import numpy as np
 from reference import maths
 from reference.maths import Array, length, multiply, rotate
 
-SETTLED = 1.0  # s without a change of weights
+FADING = 0.1  # of a weight
+SETTLED = 0.005  # m
 
 
 @dataclass
@@ -39,11 +40,10 @@ class Wish:
 class Memory:
     """What has faded in so far."""
 
-    wanted: Array
     weights: Array
     offset: Array
     rot: Array
-    since: float
+    lag: float
     hip_height: float
     fall: float
 
@@ -53,21 +53,22 @@ def step(speed: float, wish: Wish, before: Memory | None) -> Memory:
     hip_height = float(np.mean(wish.hips - wish.lift, axis=0) @ wish.up)
     offset, rot = wish.offset, wish.rot
     if before is None:
-        return Memory(wish.weights, wish.weights, offset, rot, SETTLED + 1.0, hip_height, 0.0)
-    since = before.since + wish.dt if np.array_equal(wish.weights, before.wanted) else 0.0
-    fall = falling = max((before.hip_height - hip_height) / wish.dt, 0.0)
-    if wish.weights.any():
-        fall = before.fall if since < SETTLED else 0.0
+        return Memory(wish.weights, offset, rot, 0.0, hip_height, 0.0)
+    unfaded = max(abs(wish.weights - before.weights))
+    falling = max((before.hip_height - hip_height) / wish.dt, 0.0)
+    landing = before.fall * min(unfaded / FADING + before.lag / SETTLED, 1.0)
+    fall = max(falling * (1.0 - max(wish.weights)), landing)
     limit = max(speed, fall - falling) * wish.dt
 
-    legs_fade = not np.array_equal(wish.weights, before.weights)
-    body_limit = limit / 2.0 if legs_fade else limit
-    angle = angle_of(multiply(rot, maths.inverse(before.rot)))
-    gap = length(offset - before.offset) + float(np.max(wish.reach)) * angle
-    if since < SETTLED and gap > body_limit:
-        since = 0.0
-        offset = before.offset + (offset - before.offset) * body_limit / gap
-        rot = maths.nlerp(before.rot, rot, body_limit / gap)
+    body_limit = limit * (1.0 - 0.5 * min(unfaded / FADING, 1.0))
+    reach = float(np.max(wish.reach))
+    gap = length(offset - before.offset) + reach * angle_of(
+        multiply(rot, maths.inverse(before.rot))
+    )
+    lag = min(max(gap - body_limit, 0.0), max(reach * unfaded, before.lag - body_limit))
+    if lag > 0:
+        offset = before.offset + (offset - before.offset) * (1.0 - lag / gap)
+        rot = maths.nlerp(before.rot, rot, 1.0 - lag / gap)
 
     weights = []
     for leg, weight in enumerate(before.weights):
@@ -75,7 +76,7 @@ def step(speed: float, wish: Wish, before: Memory | None) -> Memory:
         size = correction(wish, leg, offset, rot, weight)
         largest = budget / size if size > 1e-6 else 1.0
         weights.append(maths.move_towards(weight, wish.weights[leg], largest))
-    return Memory(wish.weights, np.array(weights), offset, rot, since, hip_height, fall)
+    return Memory(np.array(weights), offset, rot, lag, hip_height, fall)
 
 
 def angle_of(rot: Array) -> float:
