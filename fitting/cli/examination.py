@@ -16,7 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from fitting.report.layout import wrapped
+from fitting.report.formatting import wrapped
 from fitting.runtime import activity, xla
 from fitting.runtime.validation import in_one_line
 

@@ -27,8 +27,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from fitting.report.formatting import TableText, parts_of
-from fitting.report.layout import INDENT, NARROWEST
+from fitting.report.formatting import INDENT, NARROWEST, TableText, parts_of
 from fitting.runtime import activity
 from fitting.runtime.activity import Work
 

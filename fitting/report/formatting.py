@@ -5,11 +5,15 @@ in it, so that the command line can draw them; to everybody else it is what it s
 """
 
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 Table: TypeAlias = list[list[str]]  # rows of cells, the heading first
+
+NARROWEST = 28  # characters of prose beside the other columns; else it goes below them
+INDENT = "    "
 
 
 class TableText(str):
@@ -67,7 +71,7 @@ def interval(low: float, high: float) -> str:
     return f"{low:.4g} to {high:.4g}"
 
 
-def bullets(lines: list[str]) -> str:
+def bullets(lines: Sequence[str]) -> str:
     """A Markdown list."""
     return "\n".join(f"- {line}" for line in lines)
 
@@ -81,6 +85,34 @@ def aligned(table: Table) -> TableText:
     ]
     text = "\n".join([lines[0], "-" * max(len(line) for line in lines), *lines[1:]])
     return TableText(text, table)
+
+
+def wrapped(table: Table, width: int) -> TableText:
+    """A table as lines of at most this many characters, where no single cell is wider.
+
+    Args:
+        table: rows of cells, the last of which is prose. A row of one cell is a heading.
+        width: characters in a line.
+    """
+    rows = [row for row in table if len(row) > 1]
+    columns = list(zip(*rows, strict=True))[:-1]
+    widths = [max(map(len, column)) for column in columns]
+    left = sum(size + 2 for size in widths)
+    lines = []
+    for row in table:
+        if len(row) == 1:
+            lines += ["", row[0]]
+            continue
+        cells = [cell.ljust(size) for cell, size in zip(row, widths, strict=False)]
+        head, prose = "  ".join(cells), row[-1]
+        if width - left >= NARROWEST:
+            parts = textwrap.wrap(prose, width - left) or [""]
+            lines.append(f"{head}  {parts[0]}".rstrip())
+            lines += [f"{' ' * left}{part}" for part in parts[1:]]
+        else:
+            lines.append(head.rstrip())
+            lines += textwrap.wrap(prose, width, initial_indent=INDENT, subsequent_indent=INDENT)
+    return TableText("\n".join(lines).strip("\n"), table, is_prose=True)
 
 
 def markdown(table: Table) -> str:

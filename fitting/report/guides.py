@@ -13,8 +13,7 @@ from fitting.experiment import systems
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 
-from .formatting import Table, interval, markdown
-from .layout import wrapped
+from .formatting import Table, interval, markdown, wrapped
 
 KEY_HEADING = ["key", "value", "default", "meaning"]
 WORDS = {"boolean": "true, false", "string": "text", "object": "table", "null": ""}

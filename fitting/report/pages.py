@@ -99,6 +99,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["prose"] = prose
+    environment.filters["kind"] = lambda block: type(block).__name__
     return environment
 
 
@@ -130,6 +131,17 @@ def embed(folder: Path, captions: Mapping[str, str]) -> list[Picture]:
     paths = [folder / name for name in captions if (folder / name).is_file()]
     room = MAX_BYTES // max(len(paths), 1)
     return [_embed(path, captions[path.name], room) for path in paths]
+
+
+def pictures(folder: Path, captions: Mapping[str, str]) -> dict[str, Picture]:
+    """Pictures of a folder, those that are too large scaled down: all are `MAX_BYTES` at most.
+
+    Args:
+        folder: that has them, as PNG.
+        captions: by file name.
+    """
+    room = MAX_BYTES // max(len(captions), 1)
+    return {name: _embed(folder / name, caption, room) for name, caption in captions.items()}
 
 
 def _embed(path: Path, caption: str, room: int) -> Picture:

@@ -36,21 +36,25 @@ from fitting.ground.ground_path import place_root
 from fitting.inference.optimise.solution import Progress
 from fitting.inference.sample.blocks import SamplerSettings
 from fitting.motion.accuracy import Accuracy, Errors, clip_errors, summarise
-from fitting.report import pages, style
+from fitting.report import pages
+from fitting.report.document import (
+    Document,
+    Finding,
+    Grid,
+    Plot,
+    Points,
+    Section,
+    Terms,
+    Text,
+)
 from fitting.report.formatting import (
     ACCURACY,
     Table,
-    aligned,
-    bullets,
-    explanations,
     headings,
-    joined,
-    markdown,
     meanings,
     number,
     transposed,
 )
-from fitting.report.pages import Block, Finding, Grid, Points, Section, StudyPage, Terms, Text
 from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
@@ -61,7 +65,7 @@ from jaxik.world.similarity import similar
 from .animations import Animation
 from .fit.assess import search_with_noise
 from .fit.sentences import listed
-from .output import Log, log_output, output_folder, silent
+from .output import Log, output_folder, report, silent
 
 NUMBERS = "contribution.json"
 
@@ -69,12 +73,6 @@ TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
 SHOWN = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "pop")
 
 MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
-FILES = {
-    TABLE: "the tables",
-    CELLS: "all figures",
-    NUMBERS: "all fits",
-    FIGURE: "the figure",
-}
 
 PANELS_PER_ROW = 4
 ABLATED = STAGES[1]
@@ -377,14 +375,6 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
     ROWS_FILE.write(folder / NUMBERS, {"rows": content})
 
 
-def write(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
-    """Writes table.md, table.csv and contribution.png into an existing folder."""
-    title = f"{experiment.name}: without each of its rules"
-    style.save(folder / FIGURE, overview(rows, title))
-    files.write_text(folder / CELLS, cells(rows))
-    files.write_text(folder / TABLE, _summary(experiment, rows))
-
-
 def row_text(row: Row) -> str:
     """A finished row in one line, for the terminal."""
     figures = ", ".join(
@@ -392,15 +382,6 @@ def row_text(row: Row) -> str:
         for key in SHOWN
     )
     return f"{row_name(row)}: {figures}; {row.seconds:.0f} s"
-
-
-def tables_text(rows: Sequence[Row]) -> str:
-    """All groups of rows, for the terminal."""
-    groups = [
-        joined(["", f"{title}:", "", aligned(group(rows, part))])
-        for part, title in titles(rows).items()
-    ]
-    return joined(groups)
 
 
 def titles(rows: Sequence[Row]) -> dict[int, str]:
@@ -441,23 +422,6 @@ def cells(rows: Sequence[Row]) -> str:
         fit = [len(row.values), row.converged, f"{row.seconds:.1f}"]
         writer.writerow([row.variant, row.part or "nothing", *figures, *fit])
     return text.getvalue()
-
-
-def _summary(experiment: Experiment, rows: Sequence[Row]) -> str:
-    parts = [
-        f"# {experiment.name}: without each of its rules",
-        "Each row is a fit of its own. In brackets: how much a figure rises without the rule. "
-        "Measured at the rate of the clips.",
-    ]
-    for part, title in titles(rows).items():
-        parts += [f"## {title}", markdown(group(rows, part))]
-    parts += [f"![All figures]({FIGURE})", "## What is left out", bullets(changes(experiment))]
-    parts += ["## Fitted values, on everything", markdown(values(rows))]
-    if unconverged := [row for row in rows if not row.converged]:
-        parts.append("Fits that did not converge:")
-        parts.append(bullets([f"{row_name(row)}: {row.message}" for row in unconverged]))
-    parts += ["## What the columns mean", explanations(ACCURACY)]
-    return "\n\n".join(parts) + "\n"
 
 
 def changes(experiment: Experiment) -> list[str]:
@@ -504,27 +468,27 @@ class Rise(NamedTuple):
     """Whether they are further in every part."""
 
 
-def write_page(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
-    """Writes the page into the folder of an ablation, whose figure is there."""
+def document(experiment: Experiment, rows: Sequence[Row]) -> Document:
+    """What an ablation says."""
     unconverged = [row for row in rows if not row.converged]
-    StudyPage(
+    return Document(
         kind="An experiment without each of its rules",
         title=experiment.name,
         verdict=f"{len(unconverged)} fits not converged" if unconverged else "All fits converged",
         good=not unconverged,
         findings=findings(rows),
         sections=[
-            _figures(folder, experiment, rows),
+            _figures(experiment, rows),
             Section("What is left out", [Points(changes(experiment))]),
             Section(
                 "Fitted values, on everything",
-                [Grid(values(rows), "Fitted values of all variants")],
+                [Grid(values(rows), "Fitted values of all variants", brief=False)],
             ),
             _limits(rows, unconverged),
         ],
         asked=[*pages.rows(experiment), ["Parts of each clip", f"{_parts(rows)}"]],
-        files=FILES,
-    ).write(folder)
+        files={CELLS: "all figures", NUMBERS: "all fits"},
+    )
 
 
 def rises(rows: Sequence[Row]) -> list[Rise]:
@@ -609,18 +573,19 @@ def _rules(rises: Sequence[Rise]) -> list[Finding]:
     ]
 
 
-def _figures(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> Section:
-    blocks: list[Block] = [
-        Text(
-            "Each column is a fit. In brackets: how much a figure rises without the rule. "
-            "Measured at the rate of the clips."
-        )
+def _figures(experiment: Experiment, rows: Sequence[Row]) -> Section:
+    explanation = Text(
+        "Each column is a fit. In brackets: how much a figure rises without the rule. Measured at "
+        "the rate of the clips."
+    )
+    grids = [
+        Grid(transposed(group(rows, part)), title, title) for part, title in titles(rows).items()
     ]
-    for part, title in titles(rows).items():
-        blocks.append(Grid(transposed(group(rows, part)), title, title))
-    captions = {FIGURE: f"{experiment.name}: all figures without each of its rules"}
-    blocks += pages.embed(folder, captions)
-    return Section("With and without each rule", [*blocks, Terms(meanings(ACCURACY))])
+    title = f"{experiment.name}: without each of its rules"
+    plot = Plot(FIGURE, title, lambda: overview(rows, title))
+    return Section(
+        "With and without each rule", [explanation, *grids, plot, Terms(meanings(ACCURACY))]
+    )
 
 
 def _limits(rows: Sequence[Row], unconverged: Sequence[Row]) -> Section:
@@ -729,9 +694,6 @@ def ablate(
 
         rows = fit_variants(experiment, folder, folds=folds, progress=progress, on_row=log_row)
         if folder is not None:
-            with activity.announced("Drawing the report"):
-                write(folder, experiment, rows)
-                write_page(folder, experiment, rows)
-        log(tables_text(rows))
-        log_output(log, folder, TABLE)
+            files.write_text(folder / CELLS, cells(rows))
+        report(log, folder, document(experiment, rows), TABLE)
         return rows

@@ -10,6 +10,9 @@ from fitting.experiment.experiment import Experiment
 from fitting.experiment.problems import ClipData
 from fitting.problem.problem import Problem
 from fitting.report import pages
+from fitting.report.document import Document, text
+from fitting.report.formatting import joined
+from fitting.runtime import activity
 from fitting.runtime.claimed_folder import claimed
 
 from .fit import run_folder
@@ -20,7 +23,7 @@ Loaded: TypeAlias = Callable[[Experiment, Problem[jaxik.FootIK], tuple[ClipData,
 """Takes what a fit is about, once it is loaded."""
 
 
-def silent(text: str) -> None:
+def silent(line: str) -> None:
     """Drops a line of the log."""
 
 
@@ -45,9 +48,25 @@ def output_folder(output: str | Path | None) -> Iterator[Path | None]:
         yield Path(output)
 
 
-def log_output(log: Log, folder: Path | None, text: str) -> None:
+def report(log: Log, folder: Path | None, document: Document, name: str) -> None:
+    """Writes a document into the folder, if there is one, and logs it in brief.
+
+    Args:
+        log: takes the text, and where the results are.
+        folder: for its files.
+        document: what a study says.
+        name: of its Markdown file.
+    """
+    if folder is not None:
+        with activity.announced("Drawing the report"):
+            document.write(folder, name)
+    log(joined(["", text(document)]))
+    log_output(log, folder, name)
+
+
+def log_output(log: Log, folder: Path | None, name: str) -> None:
     """Logs where the results are, and the name of the file to read first."""
     if folder is not None:
         page = folder / pages.PAGE
         in_browser = f", or open {page} in a browser" if page.is_file() else ""
-        log(f"written to {folder}; read {folder / text}{in_browser}")
+        log(f"written to {folder}; read {folder / name}{in_browser}")

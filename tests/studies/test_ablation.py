@@ -268,17 +268,16 @@ def test_all_figures_are_in_the_csv_in_the_units_of_their_columns():
 
 def test_summary_and_page_show_groups_ablations_and_fits_that_did_not_converge(tmp_path):
     experiment = load(tmp_path)
-    ablation.write(tmp_path, experiment, ROWS)
+    ablation.document(experiment, ROWS).write(tmp_path, ablation.TABLE)
     text = (tmp_path / ablation.TABLE).read_text()
-    assert text.count("\n| without pitch |") == 3 and "Part 1 of 2 held out" in text
+    assert text.count("|  | all rules | without pitch |") == 3 and "Part 1 of 2 held out" in text
     assert "- **pitch**: `foot.max_pitch` = 0.2\n" in text
     assert "| `foot.max_pitch` | 0.4 | – |" in text
-    assert "- without pitch, part 2 held out: Far off." in text
-    assert all(f"- **{column.heading}** ({column.unit})" in text for column in ACCURACY.values())
+    assert "- Not converged: without pitch, part 2 held out: Far off." in text
+    assert all(f"- **{column.heading} ({column.unit})**" in text for column in ACCURACY.values())
     head = (tmp_path / ablation.FIGURE).read_bytes()[:24]
     wide, high = struct.unpack(">II", head[16:24])
     assert 1000 < wide < 2000 and 400 < high < 2000
-    ablation.write_page(tmp_path, experiment, ROWS)
     page = Page(tmp_path / pages.PAGE)
     assert "2 fits not converged ◐ 2 of 6 fits did not converge" in page.text
     assert "3.10 cm from the captured ones (rms) on parts that were held out, 2.50 cm" in page.text

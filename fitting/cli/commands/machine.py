@@ -10,7 +10,7 @@ from fitting.bench import report as bench_report
 from fitting.bench.workloads import FULL, QUICK
 from fitting.cli import progress
 from fitting.cli.terminal import show
-from fitting.report.layout import wrapped
+from fitting.report.formatting import wrapped
 from fitting.runtime import activity, cache_folder
 from fitting.runtime.validation import in_one_line
 

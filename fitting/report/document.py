@@ -1,0 +1,228 @@
+"""What a study says, once: a `Document`, which the terminal, Markdown, HTML and notebooks render.
+
+A study makes one of its result; `Document.write` draws its plots and writes it as Markdown and as
+a page, `text` gives what the terminal shows. What has nothing to say (a list without lines, a table
+without rows, a section of only such) is left out everywhere.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from matplotlib.figure import Figure
+
+from fitting.runtime import files
+from fitting.runtime.json_files import write_json
+
+from . import formatting, motion_data, pages, style
+from .formatting import JoinedText, Table, aligned, bullets, joined
+from .motion_data import ShownClip
+
+ASKED = "What was asked"
+
+
+class Text(NamedTuple):
+    """A paragraph; what is `code` or **strong** in Markdown is so."""
+
+    text: str
+    brief: bool = False
+    """Whether a terminal shows it."""
+
+
+class Points(NamedTuple):
+    """A list of sentences."""
+
+    lines: Sequence[str]
+    brief: bool = False
+    """Whether a terminal shows it."""
+
+
+class Terms(NamedTuple):
+    """Names and what they mean; no terminal shows them."""
+
+    rows: Sequence[Sequence[str]]
+
+
+class Grid(NamedTuple):
+    """A table; a cell that ends with an exclamation mark is shown as a miss."""
+
+    rows: Table
+    label: str
+    """For those who do not see it."""
+    title: str = ""
+    brief: bool = True
+    """Whether a terminal shows it."""
+
+
+class Plot(NamedTuple):
+    """A figure, drawn into a file beside the document; no terminal shows it."""
+
+    name: str
+    """Of the file."""
+    caption: str
+    draw: Callable[[], Figure]
+
+
+class Jump(NamedTuple):
+    """A button that shows the worst seconds of a motion in the page's view."""
+
+    words: str
+    clip: int
+    """Its number among the clips of the view, from 0."""
+    key: str
+    """Of the motion."""
+
+
+Block: TypeAlias = Text | Points | Terms | Grid | Plot | Jump
+
+
+class Finding(NamedTuple):
+    """A sentence that says what was found."""
+
+    text: str
+    bad: bool = False
+    """Whether it says what went badly."""
+
+
+class Section(NamedTuple):
+    """A heading, and what stands below it."""
+
+    heading: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class View:
+    """The motion in 3-D, which only the page shows."""
+
+    clips: Sequence[ShownClip]
+    names: Sequence[str]
+    """Of the clips."""
+    visible: str
+    """From which depth on a sole in the ground is marked, with its unit."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """All that a study says."""
+
+    kind: str
+    """What was done, in a few words."""
+    title: str
+    verdict: str
+    """In two or three words."""
+    good: bool
+    """Whether the verdict is good news."""
+    findings: Sequence[Finding]
+    """Every rendering begins with those that say what went badly."""
+    sections: Sequence[Section]
+    asked: Table
+    """What was asked, a name and a text each."""
+    numbers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """The content of the JSON files that have all numbers, by file name."""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """What is in which other file beside it, by file name; `write` does not write these."""
+    view: View | None = None
+
+    @property
+    def sentences(self) -> list[str]:
+        """The findings, what went badly first."""
+        return [finding.text for finding in sorted(self.findings, key=lambda f: not f.bad)]
+
+    @property
+    def filled(self) -> list[Section]:
+        """The sections that say something, with the blocks that do."""
+        sections = [Section(head, list(filter(_says_something, of))) for head, of in self.sections]
+        return [section for section in sections if section.blocks]
+
+    @property
+    def blocks(self) -> Iterator[Block]:
+        """The blocks of all sections."""
+        return (block for section in self.filled for block in section.blocks)
+
+    @property
+    def plots(self) -> list[Plot]:
+        """The plots of all sections."""
+        return [block for block in self.blocks if isinstance(block, Plot)]
+
+    def write(self, folder: Path, name: str) -> None:
+        """Draws the plots, and writes the numbers, and the document as Markdown and as a page.
+
+        Args:
+            folder: is made if needed.
+            name: of the Markdown file.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, content in self.numbers.items():
+            write_json(folder / path, content)
+        for plot in self.plots:
+            style.save(folder / plot.name, plot.draw())
+        files.write_text(folder / name, markdown(self))
+        pictures = pages.pictures(folder, {plot.name: plot.caption for plot in self.plots})
+        spent = sum(picture.size for picture in pictures.values())
+        clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
+        beside = {name: "the text"} | dict.fromkeys(self.numbers, "all numbers")
+        beside |= {**self.files} | {plot.name: "a figure" for plot in self.plots}
+        pages.write(
+            folder / pages.PAGE, "document.html", clips,
+            document=self, title=self.title, pictures=pictures, beside=beside,
+        )  # fmt: skip
+
+
+def _says_something(block: Block) -> bool:
+    match block:
+        case Text(text=text):
+            return bool(text)
+        case Points(lines=lines):
+            return bool(lines)
+        case Grid(rows=rows):
+            return len(rows) > 1
+        case _:
+            return True
+
+
+def text(document: Document) -> JoinedText:
+    """The document in brief, for a terminal: verdict, findings, tables."""
+    parts = [f"{document.verdict}.", bullets(document.sentences)]
+    for block in document.blocks:
+        match block:
+            case Text(text=words, brief=True):
+                parts.append(words)
+            case Points(lines=lines, brief=True):
+                parts.append(bullets(lines))
+            case Grid(rows=rows, title=title, brief=True):
+                parts += [f"{title}:", aligned(rows)] if title else [aligned(rows)]
+            case _:
+                pass
+    return joined(parts, apart=True)
+
+
+def markdown(document: Document) -> str:
+    """The whole document in Markdown, but for the view."""
+    parts = [f"# {document.title}", f"{document.kind}: **{document.verdict}**."]
+    sections = [*document.filled, Section(ASKED, [Terms(document.asked)])]
+    parts.append(bullets(document.sentences))
+    for section in sections:
+        parts.append(f"## {section.heading}")
+        parts += [_markdown(block) for block in section.blocks if not isinstance(block, Jump)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _markdown(block: Text | Points | Terms | Grid | Plot) -> str:
+    match block:
+        case Text():
+            return block.text
+        case Points():
+            return bullets(block.lines)
+        case Terms():
+            return bullets([f"**{name}**: {words}" for name, words in block.rows])
+        case Grid():
+            table = formatting.markdown([[_red(cell) for cell in row] for row in block.rows])
+            return f"### {block.title}\n\n{table}" if block.title else table
+        case Plot():
+            return f"![{block.caption}]({block.name})"
+
+
+def _red(cell: str) -> str:
+    return f'<span style="color:red">**{cell}**</span>' if cell.endswith("!") else cell
