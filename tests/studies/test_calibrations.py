@@ -23,7 +23,7 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import noise_of
 from fitting.inference.profiles.profile import make_profile
 from fitting.problem.problem import Problem
-from fitting.report import pages
+from fitting.report import document, pages
 from fitting.studies.calibrate import calibration, calibration_report, replicates
 from fitting.studies.calibrate.assessment import Assessment, assess, summarise
 from fitting.studies.calibrate.calibration import Calibration, CalibrationProgress, Observers
@@ -116,15 +116,16 @@ def test_wrong_profiles_and_a_wrong_posterior_are_named(made):
     ]
 
 
-def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made):
+def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made, experiment):
     fits: list[Any] = made.kept.fits[:4]
     fits[1]["cost"] += 3.5
     fits[2] |= {"cost": fits[2]["cost"] + 90.0, "converged": False}
     fits[3]["cost"] += 2.5
-    assessment = assess(Calibration(fits, []))
+    changed = Calibration(fits, [])
+    assessment = assess(changed)
     assert (assessment.wrong, assessment.wrong_but_converged) == ((2, 3), (2,))
     assert assessment.unconverged == (3,) and assessment.valley.hits == 2
-    text = calibration_report.calibration_text(assessment)
+    text = document.text(calibration_report.document(experiment, changed, assessment))
     assert "Replicates in another valley: 2, 3 (2 in all)." in text
     assert "In another valley, but said to have converged: 2 (1 in all)." in text
     assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])
@@ -284,10 +285,11 @@ def test_the_folder_has_a_report(finished):
     out, printed = finished.folder, finished.printed
     assert f"{COUNT} truths of 2 parameters of record" in printed
     assert "replicate 3: the truth's valley, 2 of 2 starts agree" in printed
-    everything = f"Calibrated: on {COUNT} simulated motions everything is inside its bounds."
+    everything = f"Everything is inside its bounds, but {COUNT} simulated motions prove little"
     assert everything in printed and f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()
-    assert summary.startswith(f"# hill: calibration\n\n{everything}")
+    kind = "Fits of simulated motion whose truth is known"
+    assert summary.startswith(f"# hill\n\n{kind}: **Calibrated**.\n\n- {everything}")
     for picture in ("ranks.png", "recovery.png"):
         assert f"({picture})" in summary and (out / picture).stat().st_size > 10_000
     page = Page(out / pages.PAGE)
@@ -305,7 +307,7 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
     out = tmp_path / "out"
     assert main.main(["calibrate", str(path), "-n", "8", "-o", str(out)]) == 5
     printed = capsys.readouterr().out
-    assert "Not calibrated: on 8 simulated motions, outside their bounds: the fit's 95 %" in printed
+    assert "\nNot calibrated.\n\n- Of 8 simulated motions, outside their bounds: the" in printed
     assert "**no**, too few" in printed
     assert not (out / "ranks.png").exists(), "there are no chains"
     page = Page(out / pages.PAGE)

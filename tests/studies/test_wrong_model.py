@@ -20,7 +20,7 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.inference import sensitivity
 from fitting.motion.goodness import CLOSE
 from fitting.problem.space import present_value
-from fitting.report import pages
+from fitting.report import document, pages
 from fitting.studies.calibrate import wrong_model, wrong_model_report
 from fitting.studies.calibrate.wrong_model import (
     LARGEST,
@@ -244,12 +244,13 @@ def test_a_kept_system_that_is_worse_than_the_animation_is_outside():
     assert assessment.medians["kept"] == assessment.medians["before"]
 
 
-def test_false_verdicts_are_outside_and_shown():
+def test_false_verdicts_are_outside_and_shown(tmp_path):
     fits = [replicate(judgement(), FAR)] * 3 + [replicate()]
     assessment = assess(fits)
     assert assessment.outside == ["the share of true verdicts"] and assessment.false == (1, 2, 3)
     assert (assessment.verdicts_of["fits"].hits, assessment.verdicts_of["fits"].total) == (1, 4)
-    text = wrong_model_report.text(assessment, fits)
+    experiment = load_experiment(write(tmp_path))
+    text = document.text(wrong_model_report.document(experiment, "mec", fits, assessment))
     assert "outside their bounds: the share of true verdicts" in text
     assert 'Replicate 1 says: "Said." Without errors: ankles 1.0 cm, knees 1.5 cm' in text
     assert "ankles 2.5 cm, knees 3.8 cm" in text

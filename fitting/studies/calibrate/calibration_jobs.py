@@ -9,10 +9,9 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import load_clips, make_problem, problem_from_clips
 from fitting.experiment.systems import without_own_root
-from fitting.report.formatting import joined
-from fitting.runtime import activity, cluster
+from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
-from fitting.studies.output import Log, log_output, output_folder, silent
+from fitting.studies.output import Log, output_folder, report, silent
 from fitting.studies.translation import load_named_system
 
 from . import calibration, calibration_report, wrong_model, wrong_model_report
@@ -75,12 +74,8 @@ def calibrate(
                 chains=chains, noise_factor=noise_factor, client=client, observers=observers,
             )  # fmt: skip
         assessment = assess(made)
-        if folder is not None:
-            with activity.announced("Drawing the report"):
-                calibration_report.write(folder, experiment, made, assessment)
-                calibration_report.write_page(folder, experiment, assessment)
-        log(joined(["", calibration_report.calibration_text(assessment)]))
-        log_output(log, folder, calibration_report.SUMMARY)
+        document = calibration_report.document(experiment, made, assessment)
+        report(log, folder, document, calibration_report.SUMMARY)
         return assessment
 
 
@@ -135,10 +130,6 @@ def calibrate_wrong_model(
                 on_fit=lambda fitted: log(wrong_model_report.fit_line(fitted)),
             )  # fmt: skip
         assessment = wrong_model.assess(fits)
-        if folder is not None:
-            with activity.announced("Drawing the report"):
-                wrong_model_report.write(folder, experiment, system.name, fits, assessment)
-                wrong_model_report.write_page(folder, experiment, system.name, fits, assessment)
-        log(joined(["", wrong_model_report.text(assessment, fits)]))
-        log_output(log, folder, wrong_model_report.SUMMARY)
+        document = wrong_model_report.document(experiment, system.name, fits, assessment)
+        report(log, folder, document, calibration_report.SUMMARY)
         return assessment

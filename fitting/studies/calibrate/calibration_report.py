@@ -1,7 +1,6 @@
 """The report of a calibration: what is true of the fits' and the posteriors' claims."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,12 +11,10 @@ from scipy import special
 
 from fitting.experiment.experiment import Experiment
 from fitting.inference.proportions import Proportion, RankTest
-from fitting.report import pages, style
-from fitting.report.formatting import Table, aligned, bullets, joined, markdown, percent
-from fitting.report.pages import Finding, Grid, Points, Section, StudyPage, Text
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import Table, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, styled
-from fitting.runtime import files
-from fitting.runtime.json_files import write_json
 from fitting.studies.fit.sentences import listed
 
 from .assessment import FAMILY_LEVEL, FIT_LEVEL, IN_VALLEY, NEAR, SAME_VALLEY, Assessment, summarise
@@ -43,11 +40,6 @@ BINS = {100: 20, 0: 10}  # of a histogram, from so many replicates on
 BAND = "#dddddd"
 
 WIDE = 0.2  # of bounds, from which being inside them proves little
-FILES = {
-    SUMMARY: "the tables",
-    NUMBERS: "all numbers",
-    RECOVERY: "fitted against true values",
-}
 
 
 def fit_line(fitted: ReplicateFit) -> str:
@@ -68,21 +60,6 @@ def chain_line(chain: ReplicateChain) -> str:
     )
 
 
-def sentence(assessment: Assessment) -> str:
-    """What was found, in two sentences."""
-    count = assessment.replicates
-    made = f"{count} simulated motion{'s' * (count != 1)}"
-    cover = assessment.fit_coverage
-    coverage = (
-        f"The fit's 95 % intervals contain {percent(cover.fraction, 0)} of the true values "
-        f"({percent(cover.low, 0)} to {percent(cover.high, 0)})."
-    )
-    if assessment.inside:
-        return f"Calibrated: on {made} everything is inside its bounds. {coverage}"
-    outside = _listed(assessment.outside)
-    return f"Not calibrated: on {made}, outside their bounds: {outside}. {coverage}"
-
-
 def explanation(assessment: Assessment) -> str:
     """What was done, and what the bounds are."""
     return (
@@ -93,45 +70,44 @@ def explanation(assessment: Assessment) -> str:
     )
 
 
-def calibration_text(assessment: Assessment) -> str:
-    """The result of a calibration, for the terminal."""
-    tables = [aligned(checks_table(assessment)), aligned(parameter_table(assessment))]
-    return joined([sentence(assessment), *tables, *_listed_remarks(assessment)], apart=True)
-
-
-def write(
-    folder: Path, experiment: Experiment, calibration: Calibration, assessment: Assessment
-) -> None:
-    """Writes calibration.json, summary.md and the pictures into an existing folder."""
-    numbers = {"experiment": experiment.name, **summarise(assessment)}
-    write_json(folder / NUMBERS, numbers)
-    title = f"{experiment.name}: fitted against true values"
-    style.save(folder / RECOVERY, recovery(calibration.fits, title))
-    parts = [
-        f"# {experiment.name}: calibration",
-        sentence(assessment),
-        explanation(assessment),
-        markdown(checks_table(assessment)),
-        *_listed_remarks(assessment),
-        "## Parameters",
-        markdown(parameter_table(assessment)),
-        CAME_BACK,
-        f"![Fitted against true values]({RECOVERY})",
+def document(experiment: Experiment, calibration: Calibration, assessment: Assessment) -> Document:
+    """What a calibration says."""
+    name = experiment.name
+    fitted_title, ranks_title = (
+        f"{name}: fitted against true values",
+        f"{name}: ranks of the truths among {DRAWS} draws",
+    )
+    sections = [
+        Section(
+            "Checks",
+            [
+                Text(explanation(assessment)),
+                Grid(checks_table(assessment), "All checks"),
+                Points(remarks(assessment), brief=True),
+            ],
+        ),
+        Section(
+            "Parameters",
+            [
+                Grid(parameter_table(assessment), "What was found for each parameter"),
+                Text(CAME_BACK),
+                Plot(RECOVERY, fitted_title, lambda: recovery(calibration.fits, fitted_title)),
+            ],
+        ),
     ]
     if assessment.ranks:
-        title = f"{experiment.name}: ranks of the truths among {DRAWS} draws"
-        style.save(folder / RANKS, ranks(assessment.ranks, title))
-        parts += [
-            "## Ranks",
-            RANKED,
-            f"![Ranks]({RANKS})",
-        ]
-    files.write_text(folder / SUMMARY, "\n\n".join(parts) + "\n")
-
-
-def _listed_remarks(assessment: Assessment) -> list[str]:
-    lines = remarks(assessment)
-    return [bullets(lines)] if lines else []
+        plot = Plot(RANKS, ranks_title, lambda: ranks(assessment.ranks, ranks_title))
+        sections.append(Section("Ranks", [Text(RANKED), plot]))
+    return Document(
+        kind="Fits of simulated motion whose truth is known",
+        title=name,
+        verdict="Calibrated" if assessment.inside else "Not calibrated",
+        good=assessment.inside,
+        findings=findings(assessment),
+        sections=[*sections, _limits(assessment)],
+        asked=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
+        numbers={NUMBERS: {"experiment": name, **summarise(assessment)}},
+    )
 
 
 def remarks(assessment: Assessment) -> list[str]:
@@ -158,10 +134,6 @@ def listed_replicates(sentences: Mapping[str, tuple[int, ...]]) -> list[str]:
 def _numbers(found: tuple[int, ...]) -> str:
     shown = ", ".join(map(str, found[:LISTED]))
     return f"{shown}{' and others' if len(found) > LISTED else ''} ({len(found)} in all)"
-
-
-def _listed(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def checks_table(assessment: Assessment) -> Table:
@@ -315,43 +287,6 @@ def _recovered(axes: Axes, fits: Sequence[ReplicateFit], i: int) -> None:
     axes.locator_params(nbins=5)
 
 
-def write_page(folder: Path, experiment: Experiment, assessment: Assessment) -> None:
-    """Writes the page into the folder of a calibration, whose pictures are there."""
-    captions = {RECOVERY: f"{experiment.name}: fitted against true values"}
-    if assessment.ranks:
-        captions[RANKS] = f"{experiment.name}: ranks of the truths"
-    recovery, *ranks = pages.embed(folder, captions)
-    sections = [
-        Section(
-            "Checks",
-            [
-                Text(explanation(assessment)),
-                Grid(checks_table(assessment), "All checks"),
-            ],
-        ),
-        Section(
-            "Parameters",
-            [
-                Grid(parameter_table(assessment), "What was found for each parameter"),
-                Text(CAME_BACK),
-                recovery,
-            ],
-        ),
-    ]
-    if assessment.ranks:
-        sections.append(Section("Ranks", [Text(RANKED), *ranks]))
-    StudyPage(
-        kind="Fits of simulated motion whose truth is known",
-        title=experiment.name,
-        verdict="Calibrated" if assessment.inside else "Not calibrated",
-        good=assessment.inside,
-        findings=findings(assessment),
-        sections=[*sections, _limits(assessment)],
-        asked=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
-        files=FILES | ({RANKS: "ranks"} if ranks else {}),
-    ).write(folder)
-
-
 def findings(assessment: Assessment) -> list[Finding]:
     """Whether intervals are true, whether fits find the right valley, and what comes back."""
     return [_intervals(assessment), _valleys(assessment), _recovery(assessment)]
@@ -414,7 +349,6 @@ def _limits(assessment: Assessment) -> Section:
     lines = [
         "Motion is simulated by the system itself with the noise that the experiment assumes: that "
         "intervals are true here does not say that the system can move as people do.",
-        *remarks(assessment),
     ]
     if not assessment.ranks:
         lines.append("No posterior was sampled (`--chains`), so only fits are judged.")

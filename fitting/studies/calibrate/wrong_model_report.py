@@ -1,18 +1,14 @@
 """The report of a calibration under a wrong model: what fits are worth, and whether they say so."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from fitting.experiment.experiment import Experiment
 from fitting.motion.goodness import CLOSE, NAMES, PART_NAMES, UNSEEN, describe_distances, size
 from fitting.report import pages
-from fitting.report.formatting import Table, aligned, bullets, joined, markdown, percent
-from fitting.report.pages import Finding, Grid, Points, Section, StudyPage, Text
-from fitting.runtime import files
-from fitting.runtime.json_files import write_json
+from fitting.report.document import Document, Finding, Grid, Points, Section, Text
+from fitting.report.formatting import Table, percent
 
-from . import calibration_report
-from .calibration_report import NUMBERS, SUMMARY, WIDE, listed_replicates, share_row
+from .calibration_report import NUMBERS, WIDE, listed_replicates, share_row
 from .wrong_model import (
     LEVEL,
     TRUE_VERDICTS,
@@ -37,7 +33,6 @@ COVERED = (
     "also does the work of what the system lacks."
 )
 
-FILES = {calibration_report.SUMMARY: "the tables", calibration_report.NUMBERS: "all numbers"}
 LIMITS = [
     "Errors and truths are drawn at random, and sizes of errors are those of a careful capture: a "
     "worse one, or a person who walks as no system does, may leave more.",
@@ -148,80 +143,39 @@ def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> 
     return lines
 
 
-def text(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> str:
-    """The result, for the terminal."""
-    tables = [checks_table(assessment), distances_table(assessment)]
-    if assessment.coverage_of:
-        tables.append(coverage_table(assessment))
-    lines = remarks(assessment, fits)
-    parts = [sentence(assessment), *map(aligned, tables)]
-    return joined([*parts, *([bullets(lines)] if lines else [])], apart=True)
-
-
-def write(
-    folder: Path,
+def document(
     experiment: Experiment,
     truth: str,
     fits: Sequence[WrongModelFit],
     assessment: WrongModelAssessment,
-) -> None:
-    """Writes calibration.json and summary.md into an existing folder."""
-    numbers = {"experiment": experiment.name, "truth": truth, **summarise(assessment)}
-    write_json(folder / NUMBERS, numbers)
-    lines = remarks(assessment, fits)
-    parts = [
-        f"# {experiment.name}: calibration under a wrong model",
-        sentence(assessment),
-        explanation(truth),
-        markdown(checks_table(assessment)),
-        *([bullets(lines)] if lines else []),
-        "## Distances",
-        markdown(distances_table(assessment)),
+) -> Document:
+    """What a calibration under a wrong model says."""
+    checks = [
+        Text(explanation(truth)),
+        Grid(checks_table(assessment), "All checks"),
+        Points(remarks(assessment, fits), brief=True),
     ]
-    if assessment.coverage_of:
-        parts += ["## Parameters of both systems", COVERED, markdown(coverage_table(assessment))]
-    files.write_text(folder / SUMMARY, "\n\n".join(parts) + "\n")
-
-
-def write_page(
-    folder: Path,
-    experiment: Experiment,
-    truth: str,
-    fits: Sequence[WrongModelFit],
-    assessment: WrongModelAssessment,
-) -> None:
-    """Writes the page into the folder of a calibration."""
     sections = [
-        Section(
-            "Checks",
-            [
-                Text(explanation(truth)),
-                Grid(checks_table(assessment), "All checks"),
-            ],
-        ),
-        Section(
-            "Distances",
-            [Grid(distances_table(assessment), "Distances by motion")],
-        ),
+        Section("Checks", checks),
+        Section("Distances", [Grid(distances_table(assessment), "Distances by motion")]),
     ]
     if assessment.coverage_of:
         covered = Grid(coverage_table(assessment), "Intervals of shared parameters")
         sections.append(Section("Parameters of both systems", [Text(COVERED), covered]))
-    sections.append(Section("Limits of the data", [Points([*LIMITS, *remarks(assessment, fits)])]))
-    StudyPage(
+    return Document(
         kind="Fits of motion that another system makes",
         title=experiment.name,
         verdict="True" if assessment.inside else "Not true",
         good=assessment.inside,
         findings=_findings(assessment),
-        sections=sections,
+        sections=[*sections, Section("Limits of the data", [Points(LIMITS)])],
         asked=[
             *pages.rows(experiment),
             ["Made by", truth],
             ["Simulated motions", f"{assessment.replicates}"],
         ],
-        files=FILES,
-    ).write(folder)
+        numbers={NUMBERS: {"experiment": experiment.name, "truth": truth, **summarise(assessment)}},
+    )
 
 
 def _findings(assessment: WrongModelAssessment) -> list[Finding]:
