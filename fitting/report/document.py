@@ -7,6 +7,7 @@ without rows, a section of only such) is left out everywhere.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -107,6 +108,8 @@ class View:
 class Document:
     """All that a study says."""
 
+    file: str
+    """Name of its Markdown file."""
     kind: str
     """What was done, in a few words."""
     title: str
@@ -146,27 +149,30 @@ class Document:
         """The plots of all sections."""
         return [block for block in self.blocks if isinstance(block, Plot)]
 
-    def write(self, folder: Path, name: str) -> None:
+    @property
+    def beside(self) -> dict[str, str]:
+        """What is in which file, by file name."""
+        plots = {plot.name: "a figure" for plot in self.plots}
+        numbers = dict.fromkeys(self.numbers, "all numbers")
+        return {self.file: "the text", **numbers, **self.files, **plots}
+
+    def write(self, folder: Path) -> None:
         """Draws the plots, and writes the numbers, and the document as Markdown and as a page.
 
-        Args:
-            folder: is made if needed.
-            name: of the Markdown file.
+        The folder is made if needed.
         """
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in self.numbers.items():
             write_json(folder / path, content)
         for plot in self.plots:
             style.save(folder / plot.name, plot.draw())
-        files.write_text(folder / name, markdown(self))
+        files.write_text(folder / self.file, markdown(self))
         pictures = pages.pictures(folder, {plot.name: plot.caption for plot in self.plots})
         spent = sum(picture.size for picture in pictures.values())
         clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
-        beside = {name: "the text"} | dict.fromkeys(self.numbers, "all numbers")
-        beside |= {**self.files} | {plot.name: "a figure" for plot in self.plots}
         pages.write(
             folder / pages.PAGE, "document.html", clips,
-            document=self, title=self.title, pictures=pictures, beside=beside,
+            document=self, title=self.title, pictures=pictures,
         )  # fmt: skip
 
 
@@ -206,6 +212,8 @@ def markdown(document: Document) -> str:
     for section in sections:
         parts.append(f"## {section.heading}")
         parts += [_markdown(block) for block in section.blocks if not isinstance(block, Jump)]
+    others = (f"[{name}]({name}) has {words}" for name, words in document.beside.items())
+    parts.append(f"More in this folder: {', '.join(islice(others, 1, None))}.")
     return "\n\n".join(parts) + "\n"
 
 

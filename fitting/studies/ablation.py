@@ -65,7 +65,7 @@ from jaxik.world.similarity import similar
 from .animations import Animation
 from .fit.assess import search_with_noise
 from .fit.sentences import listed
-from .output import Log, output_folder, report, silent
+from .output import Log, output_folder, publish, silent
 
 NUMBERS = "contribution.json"
 
@@ -472,6 +472,7 @@ def document(experiment: Experiment, rows: Sequence[Row]) -> Document:
     """What an ablation says."""
     unconverged = [row for row in rows if not row.converged]
     return Document(
+        file=TABLE,
         kind="An experiment without each of its rules",
         title=experiment.name,
         verdict=f"{len(unconverged)} fits not converged" if unconverged else "All fits converged",
@@ -695,5 +696,5 @@ def ablate(
         rows = fit_variants(experiment, folder, folds=folds, progress=progress, on_row=log_row)
         if folder is not None:
             files.write_text(folder / CELLS, cells(rows))
-        report(log, folder, document(experiment, rows), TABLE)
+        publish(log, folder, document(experiment, rows))
         return rows

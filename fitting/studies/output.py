@@ -48,20 +48,19 @@ def output_folder(output: str | Path | None) -> Iterator[Path | None]:
         yield Path(output)
 
 
-def report(log: Log, folder: Path | None, document: Document, name: str) -> None:
+def publish(log: Log, folder: Path | None, document: Document) -> None:
     """Writes a document into the folder, if there is one, and logs it in brief.
 
     Args:
         log: takes the text, and where the results are.
         folder: for its files.
         document: what a study says.
-        name: of its Markdown file.
     """
     if folder is not None:
         with activity.announced("Drawing the report"):
-            document.write(folder, name)
+            document.write(folder)
     log(joined(["", text(document)]))
-    log_output(log, folder, name)
+    log_output(log, folder, document.file)
 
 
 def log_output(log: Log, folder: Path | None, name: str) -> None:

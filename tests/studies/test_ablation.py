@@ -268,7 +268,7 @@ def test_all_figures_are_in_the_csv_in_the_units_of_their_columns():
 
 def test_summary_and_page_show_groups_ablations_and_fits_that_did_not_converge(tmp_path):
     experiment = load(tmp_path)
-    ablation.document(experiment, ROWS).write(tmp_path, ablation.TABLE)
+    ablation.document(experiment, ROWS).write(tmp_path)
     text = (tmp_path / ablation.TABLE).read_text()
     assert text.count("|  | all rules | without pitch |") == 3 and "Part 1 of 2 held out" in text
     assert "- **pitch**: `foot.max_pitch` = 0.2\n" in text

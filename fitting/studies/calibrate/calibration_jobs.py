@@ -11,7 +11,7 @@ from fitting.experiment.problems import load_clips, make_problem, problem_from_c
 from fitting.experiment.systems import without_own_root
 from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
-from fitting.studies.output import Log, output_folder, report, silent
+from fitting.studies.output import Log, output_folder, publish, silent
 from fitting.studies.translation import load_named_system
 
 from . import calibration, calibration_report, wrong_model, wrong_model_report
@@ -75,7 +75,7 @@ def calibrate(
             )  # fmt: skip
         assessment = assess(made)
         document = calibration_report.document(experiment, made, assessment)
-        report(log, folder, document, calibration_report.SUMMARY)
+        publish(log, folder, document)
         return assessment
 
 
@@ -131,5 +131,5 @@ def calibrate_wrong_model(
             )  # fmt: skip
         assessment = wrong_model.assess(fits)
         document = wrong_model_report.document(experiment, system.name, fits, assessment)
-        report(log, folder, document, calibration_report.SUMMARY)
+        publish(log, folder, document)
         return assessment

@@ -99,6 +99,7 @@ def document(experiment: Experiment, calibration: Calibration, assessment: Asses
         plot = Plot(RANKS, ranks_title, lambda: ranks(assessment.ranks, ranks_title))
         sections.append(Section("Ranks", [Text(RANKED), plot]))
     return Document(
+        file=SUMMARY,
         kind="Fits of simulated motion whose truth is known",
         title=name,
         verdict="Calibrated" if assessment.inside else "Not calibrated",

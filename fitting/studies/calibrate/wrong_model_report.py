@@ -8,7 +8,7 @@ from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.formatting import Table, percent
 
-from .calibration_report import NUMBERS, WIDE, listed_replicates, share_row
+from .calibration_report import NUMBERS, SUMMARY, WIDE, listed_replicates, share_row
 from .wrong_model import (
     LEVEL,
     TRUE_VERDICTS,
@@ -163,6 +163,7 @@ def document(
         covered = Grid(coverage_table(assessment), "Intervals of shared parameters")
         sections.append(Section("Parameters of both systems", [Text(COVERED), covered]))
     return Document(
+        file=SUMMARY,
         kind="Fits of motion that another system makes",
         title=experiment.name,
         verdict="True" if assessment.inside else "Not true",

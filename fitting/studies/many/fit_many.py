@@ -14,7 +14,6 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import ClipData
 from fitting.problem.problem import Problem
-from fitting.report.formatting import joined
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Stopwatch, first_alone, waiting_for
 from fitting.runtime.plain_tree import NotPlainError
@@ -25,7 +24,7 @@ from fitting.runtime.validation import in_one_line
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit
 from fitting.studies.fit.fit_jobs import fit
-from fitting.studies.output import Log, log_output, output_folder, silent
+from fitting.studies.output import Log, output_folder, publish, silent
 
 from . import many_report, many_tasks
 from .many_tasks import (
@@ -204,16 +203,15 @@ def _computed(
 
 def _write(fits: ManyFits, experiments: Sequence[Experiment], log: Log) -> None:
     """The table, the picture and the page of what there is, and what the terminal shows."""
+    written: Sequence[str] = ()
     if fits.rows:
         with activity.announced("Writing the table"):
             written = many_tasks.write(fits.folder, fits.rows)
         if many_tasks.PARQUET not in written:
             log(many_tasks.MISSING)
-        with activity.announced("Drawing the report"):
-            many_report.write(fits, written)
-            many_report.write_page(fits, experiments, written)
-    log(joined(["", many_report.many_text(fits)]))
-    log_output(log, fits.folder, many_report.SUMMARY)
+    publish(
+        log, fits.folder if fits.rows else None, many_report.document(fits, experiments, written)
+    )
 
 
 def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:

@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from fitting.experiment.experiment import Experiment
-from fitting.report import pages, style
-from fitting.report.formatting import Table, aligned, bullets, joined, markdown, number, percent
-from fitting.report.pages import Block, Finding, Grid, Points, Section, StudyPage, Text
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import Table, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, styled
-from fitting.runtime import files
 from fitting.studies.fit.sentences import listed
 
 from .many_tasks import FittedValue, ManyFits, ManyProgress, Row
@@ -31,6 +30,11 @@ SHOWN = 15  # parameters
 SHORTEST = 1e-3  # s, of a fit as the histogram shows it
 SINGLE = 150  # fits, up to which each has its interval
 
+LIMITS = [
+    "Each clip is fitted as if there were no others: that values differ does not say that people "
+    "do. `jaxik population` tells spread from uncertainty.",
+    "Fits of one clip with several seeds differ by their search only.",
+]
 TABLES = {"fits.csv": "a row for each fit", "fits.parquet": "the same for pandas and the like"}
 
 
@@ -58,43 +62,6 @@ def progress_line(progress: ManyProgress) -> str:
     left = progress.remaining
     time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
     return f"{progress.rate:.1f} fits a minute, {time_left} left{failed}"
-
-
-def many_text(fits: ManyFits) -> str:
-    """The result, for the terminal."""
-    parts = [bullets(remarks(fits))]
-    if fits.finished:
-        parts.append(aligned(parameter_table(fits)))
-    if fits.failed:
-        parts.append(aligned(failure_table(fits)))
-    return joined(parts, apart=True)
-
-
-def remarks(fits: ManyFits) -> list[str]:
-    """How the fits went, a sentence each."""
-    count, lines = len(fits.finished), []
-    lines.append(f"Finished: {count} of {fits.total} fits.")
-    if fits.interrupted:
-        missing = fits.total - len(fits.rows)
-        rest = "fit that is missing" if missing == 1 else f"{missing} fits that are missing"
-        lines.append(f"Interrupted: the same command makes the {rest}.")
-    if fits.failed:
-        lines.append(f"**Failed**: {len(fits.failed)}; the same command tries them again.")
-    if fits.unconverged:
-        lines.append(f"**Not converged**: {len(fits.unconverged)}.")
-    if bad := misfits(fits):
-        does = "does" if bad == 1 else "do"
-        lines.append(
-            f"{bad} of {count} finished fits {does} not match the motion to within the given "
-            "sigmas, whether converged or not."
-        )
-    if made := [row["effort"] for row in fits.finished if "effort" in row]:
-        seconds = statistics.median(effort["seconds"] for effort in made)
-        cpu = statistics.median(effort["cpu_seconds"] for effort in made)
-        peaks = [effort["peak_mb"] for effort in made if effort["peak_mb"] is not None]
-        memory = f", and at most {max(peaks):.0f} MB in a process" if peaks else ""
-        lines.append(f"A fit took {seconds:.1f} s, {cpu:.1f} s of CPU time (medians){memory}.")
-    return lines
 
 
 def misfits(fits: ManyFits) -> int:
@@ -162,18 +129,42 @@ def share_by_error(fits: ManyFits) -> list[str]:
     return [f"{percent(count / fits.total, 0)}: {error}" for error, count in counts.most_common(3)]
 
 
-def write(fits: ManyFits, tables: Sequence[str]) -> None:
-    """Writes summary.md and fits.png into the folder of the fits."""
-    title = f"{fits.total} fits"
-    parts = [f"# {title}", bullets(remarks(fits))]
+def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> Document:
+    """What many fits say.
+
+    Args:
+        fits: all of them.
+        experiments: of which they are.
+        tables: names of the files that have a row for each fit.
+    """
+    title = (
+        "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
+        "grey where it does not; and how long fits took, on a logarithmic axis"
+    )
+    sections = []
     if fits.finished:
-        style.save(fits.folder / FIGURE, overview(fits, title))
-        parts += ["## Parameters", markdown(parameter_table(fits)), SPREAD]
-        parts += [f"![Fitted values and times]({FIGURE})"]
-    if fits.failed:
-        parts += ["## Failed", markdown(failure_table(fits))]
-    parts += ["## Fits", markdown(fit_table(fits)), f"All of them: {', '.join(tables)}."]
-    files.write_text(fits.folder / SUMMARY, "\n\n".join(parts) + "\n")
+        grid = Grid(parameter_table(fits), "Fitted values of all fits")
+        plot = Plot(FIGURE, title, lambda: overview(fits, f"{fits.total} fits"))
+        sections.append(Section("Parameters", [grid, Text(SPREAD), plot]))
+    return Document(
+        file=SUMMARY,
+        kind="Many fits, each in a folder of its own",
+        title=listed([experiment.name for experiment in experiments]),
+        verdict=_verdict(fits),
+        good=not (fits.failed or fits.unconverged or fits.interrupted or misfits(fits)),
+        findings=findings(fits),
+        sections=[
+            *sections,
+            Section("Failed", [Grid(failure_table(fits), "Fits that failed")]),
+            Section("Fits", [Grid(fit_table(fits), "All fits", brief=False)]),
+            Section("Limits of the data", [Points(LIMITS)]),
+        ],
+        asked=[
+            [experiment.name, f"{pages.system(experiment)}; {_clips(experiment)}"]
+            for experiment in experiments[:MANY]
+        ],
+        files={name: TABLES[name] for name in tables},
+    )
 
 
 @styled
@@ -247,40 +238,6 @@ def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
     axes.legend(loc="upper right")
 
 
-def write_page(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> None:
-    """Writes the page into the folder of the fits, whose picture is there."""
-    good = not (fits.failed or fits.unconverged or fits.interrupted or misfits(fits))
-    caption = (
-        "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
-        "grey where it does not; and how long fits took, on a logarithmic axis"
-    )
-    sections = []
-    if fits.finished:
-        blocks: list[Block] = [
-            Grid(parameter_table(fits), "Fitted values of all fits"),
-            Text(SPREAD),
-            *pages.embed(fits.folder, {FIGURE: caption}),
-        ]
-        sections.append(Section("Parameters", blocks))
-    if fits.failed:
-        sections.append(Section("Failed", [Grid(failure_table(fits), "Fits that failed")]))
-    sections.append(Section("Fits", [Grid(fit_table(fits), "All fits")]))
-    sections.append(_limits())
-    StudyPage(
-        kind="Many fits, each in a folder of its own",
-        title=listed([experiment.name for experiment in experiments]),
-        verdict=_verdict(fits),
-        good=good,
-        findings=findings(fits),
-        sections=sections,
-        asked=[
-            [experiment.name, f"{pages.system(experiment)}; {_clips(experiment)}"]
-            for experiment in experiments[:MANY]
-        ],
-        files={SUMMARY: "the tables"} | {name: TABLES[name] for name in tables},
-    ).write(fits.folder)
-
-
 def findings(fits: ManyFits) -> list[Finding]:
     """Whether all are there, whether they converged, and what a fit takes."""
     return [_completeness(fits), _convergence(fits), _effort(fits)]
@@ -303,12 +260,22 @@ def _verdict(fits: ManyFits) -> str:
 
 
 def _completeness(fits: ManyFits) -> Finding:
-    count = len(fits.finished)
+    missing = fits.total - len(fits.rows)
+    rest = f"the {missing} that {'is' if missing == 1 else 'are'} missing"
     if fits.failed:
         reasons = "; ".join(share_by_error(fits)).rstrip(".")
-        return Finding(f"{len(fits.failed)} of {fits.total} fits failed: {reasons}.", bad=True)
-    if count < fits.total:
-        return Finding(f"{count} of {fits.total} fits are there; the same command goes on.", True)
+        also = f" and makes {rest}" if missing else ""
+        return Finding(
+            f"{len(fits.failed)} of {fits.total} fits failed: {reasons}; the same command tries "
+            f"them again{also}.",
+            bad=True,
+        )
+    if missing:
+        return Finding(
+            f"{len(fits.finished)} of {fits.total} fits are finished; the same command makes "
+            f"{rest}.",
+            bad=True,
+        )
     return Finding(f"All {fits.total} fits are finished.")
 
 
@@ -329,19 +296,12 @@ def _effort(fits: ManyFits) -> Finding:
     if not efforts:
         return Finding("Nothing is known of what a fit takes.")
     seconds = statistics.median(effort["seconds"] for effort in efforts)
+    peaks = [effort["peak_mb"] for effort in efforts if effort["peak_mb"] is not None]
+    memory = f", and at most {max(peaks):.0f} MB in a process" if peaks else ""
     minutes = sum(effort["cpu_seconds"] for effort in efforts) / 60
     cpu = f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
     hosts = len({effort["host"] for effort in efforts})
     return Finding(
         f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on {hosts} "
-        f"machine{'s' * (hosts != 1)}."
+        f"machine{'s' * (hosts != 1)}{memory}."
     )
-
-
-def _limits() -> Section:
-    lines = [
-        "Each clip is fitted as if there were no others: that values differ does not say that "
-        "people do. `jaxik population` tells spread from uncertainty.",
-        "Fits of one clip with several seeds differ by their search only.",
-    ]
-    return Section("Limits of the data", [Points(lines)])
