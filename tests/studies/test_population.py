@@ -16,7 +16,7 @@ from fitting.experiment import parameter_files
 from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import NoiseOptions
-from fitting.report import pages
+from fitting.report import document, pages
 from fitting.studies.population import kept_searches, population_report
 from fitting.studies.population.population import Population, clip_names
 from jaxik.maths import parameter_tree
@@ -143,8 +143,9 @@ def test_the_folder_has_a_report_and_parameters(made):
     assert "fitting 2 parameters of record to 3 clips, 1 of them varying" in printed
     assert "uneven_walk from 1 s: cost" in printed and f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()
-    assert summary.startswith("# walks: clips and their population\n\n- `pelvis.on_gain` differs ")
-    assert "from 3 clips only." in summary and "A clip that is left out is predicted to" in summary
+    assert summary.startswith("# walks\n\nClips fitted alone, pooled and as a population: **Conv")
+    assert "- `pelvis.on_gain` differs " in summary and "from 3 clips only." in summary
+    assert "A clip that is left out is predicted to" in summary
     assert "(population.png)" in summary and (out / "population.png").stat().st_size > 10_000
     page = Page(out / pages.PAGE)
     assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
@@ -185,7 +186,8 @@ def test_the_summary_says_whether_clips_differ_as_far_as_that_is_known(fitted):
         ),
     ):
         changed = dataclasses.replace(fitted, parameters=[{**gain, "spread": spread}, pitch])
-        assert text in population_report.population_text(changed).rpartition("\n\n- ")[2]
+        brief = document.text(population_report.document(changed))
+        assert text in brief.rpartition("\n\n- ")[2]
 
 
 def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):

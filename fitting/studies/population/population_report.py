@@ -19,16 +19,15 @@ from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import make_problem
 from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress
-from fitting.report import pages, style
-from fitting.report.formatting import Table, aligned, bullets, interval, joined, markdown, number
-from fitting.report.pages import Finding, Grid, Points, Section, StudyPage, Text
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import Table, interval, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, styled
-from fitting.runtime import activity, files
-from fitting.runtime.json_files import write_json
+from fitting.runtime import files
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.sentences import listed
-from fitting.studies.output import Log, log_output, output_folder, silent
+from fitting.studies.output import Log, output_folder, publish, silent
 
 from .kept_searches import Found
 from .population import Estimate, ParameterEstimates, Population, fit_clips_and_population
@@ -61,52 +60,48 @@ APART = 0.16  # of a row, from its middle to an estimate
 COLOURS = dict(zip(ERROR_NAMES, (BEFORE, CAPTURED, AFTER, STAGES[1], STAGES[4]), strict=True))
 PANELS_PER_ROW = 3
 
-FILES = {
-    SUMMARY: "the tables",
-    NUMBERS: "all numbers",
-    run_folder.PARAMETERS: "the population's centre",
-    FIGURE: "the figure",
-}
-
 
 def found_line(found: Found) -> str:
     """A finished search in one line, for the terminal."""
     return f"{found['name']}: cost {number(found['cost'])}, {found['seconds']:.1f} s"
 
 
-def population_text(population: Population) -> str:
-    """The result, for the terminal."""
-    tables = [aligned(parameter_table(population)), aligned(error_table(population))]
-    return joined([*tables, bullets(remarks(population))], apart=True)
-
-
-def write(folder: Path, population: Population) -> None:
-    """Writes population.json, summary.md and population.png into an existing folder."""
-    name = population.experiment.name
-    title = f"{name}: clips and their population"
-    style.save(folder / FIGURE, overview(population, title))
-    write_json(folder / NUMBERS, population.summary)
-    parts = [
-        f"# {title}",
-        bullets(remarks(population)),
-        "## Parameters",
-        markdown(parameter_table(population)),
-        PARAMETERS,
-        f"![Clips and their population]({FIGURE})",
-        "## Errors",
-        markdown(error_table(population)),
-        ERRORS,
-    ]
-    files.write_text(folder / SUMMARY, "\n\n".join(parts) + "\n")
+def document(population: Population) -> Document:
+    """What a population says."""
+    count = len(population.unconverged)
+    title = f"{population.experiment.name}: clips and their population"
+    return Document(
+        file=SUMMARY,
+        kind="Clips fitted alone, pooled and as a population",
+        title=population.experiment.name,
+        verdict="Converged" if population.converged else f"{count} not converged",
+        good=population.converged,
+        findings=findings(population),
+        sections=[
+            Section(
+                "Parameters",
+                [
+                    Grid(parameter_table(population), "Parameters of clips and population"),
+                    Text(PARAMETERS),
+                    Plot(FIGURE, title, lambda: overview(population, title)),
+                ],
+            ),
+            Section("Errors", [Grid(error_table(population), "Errors"), Text(ERRORS)]),
+            Section("In detail", [Points(remarks(population), brief=True)]),
+            _limits(population),
+        ],
+        asked=[*pages.rows(population.experiment), ["What varies", _varying(population)]],
+        numbers={NUMBERS: population.summary},
+        files={run_folder.PARAMETERS: "the population's centre"},
+    )
 
 
 def remarks(population: Population) -> list[str]:
-    """What was found, a sentence each."""
+    """What the findings leave out, a sentence each."""
     lines = [f"**Not converged**: {line}" for line in population.unconverged]
     lines += [
         _difference(population, row) for row in population.parameters if row["spread"] is not None
     ]
-    lines.append(prediction(population))
     if (leg_length := population.leg_length) is not None:
         lines.append(
             f"Values are those of a body with legs of {number(leg_length)} m; those of each clip's "
@@ -130,18 +125,6 @@ def _difference(population: Population, row: ParameterEstimates) -> str:
     else:
         words = f"is alike in all {things} as far as they tell: spread at most {high:.4g}"
     return f"`{row['name']}` {words}{few}."
-
-
-def prediction(population: Population) -> str:
-    """How well a clip is predicted from the others."""
-    by_population, by_pooled, alone = (
-        f"{CM * mean_error(population, key):.2f} cm"
-        for key in ("left_out_population", "left_out_pooled", "alone")
-    )
-    return (
-        f"A clip that is left out is predicted to {by_population} by the population of the others "
-        f"and to {by_pooled} by their pooled fit; fitted alone, {alone} are left."
-    )
 
 
 def parameter_table(population: Population) -> Table:
@@ -264,37 +247,6 @@ def _errors(axes: Axes, population: Population) -> None:
     axes.set_xlabel("cm, rms")
 
 
-def write_page(folder: Path, population: Population) -> None:
-    """Writes the page into the folder of a population, whose figure is there."""
-    count = len(population.unconverged)
-    caption = f"{population.experiment.name}: clips and their population"
-    StudyPage(
-        kind="Clips fitted alone, pooled and as a population",
-        title=population.experiment.name,
-        verdict="Converged" if population.converged else f"{count} not converged",
-        good=population.converged,
-        findings=findings(population),
-        sections=[
-            Section(
-                "Parameters",
-                [
-                    Grid(parameter_table(population), "Parameters of clips and population"),
-                    Text(PARAMETERS),
-                    *pages.embed(folder, {FIGURE: caption}),
-                ],
-            ),
-            Section(
-                "Errors",
-                [Grid(error_table(population), "Errors"), Text(ERRORS)],
-            ),
-            Section("In detail", [Points(remarks(population))]),
-            _limits(population),
-        ],
-        asked=[*pages.rows(population.experiment), ["What varies", _varying(population)]],
-        files=FILES,
-    ).write(folder)
-
-
 def findings(population: Population) -> list[Finding]:
     """Whether all converged, what differs, and whether clips are predicted from each other."""
     return [_convergence(population), _differences(population), _prediction(population)]
@@ -413,11 +365,7 @@ def population(
         )
         if folder is not None:
             _write_systems(folder, fitted)
-            with activity.announced("Drawing the report"):
-                write(folder, fitted)
-                write_page(folder, fitted)
-        log(joined(["", population_text(fitted)]))
-        log_output(log, folder, SUMMARY)
+        publish(log, folder, document(fitted))
         return fitted
 
 
