@@ -54,7 +54,7 @@ def comparison_path(tmp_path_factory) -> Path:
 def plain_path(tmp_path_factory) -> Path:
     """A page without a view."""
     folder = tmp_path_factory.mktemp("plain")
-    run_comparison.write_page(folder, RUNS)
+    run_comparison.document(RUNS).write(folder)
     return folder / pages.PAGE
 
 

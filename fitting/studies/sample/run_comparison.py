@@ -10,17 +10,22 @@ import numpy as np
 
 from fitting.inference.sample import blocks, inference_data
 from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
-from fitting.report.formatting import Table, aligned, joined, markdown
-from fitting.report.pages import Finding, Grid, Points, Section, StudyPage, Text
+from fitting.report.document import Document, Finding, Grid, Points, Section, Text
+from fitting.report.formatting import Table
 from fitting.runtime import activity, files
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.sentences import listed
-from fitting.studies.output import Log, log_output, output_folder, silent
+from fitting.studies.output import Log, output_folder, publish, silent
 
 TABLE, NUMBERS = "runs.md", "runs.json"
 
 CLEAR = 2.0  # standard errors, from which a difference says something
-FILES = {TABLE: "the table", NUMBERS: "all numbers"}
+LIMITS = [
+    "The order is that of these runs on this motion: the best of them may still not fit it, which "
+    "the page of its run says.",
+    "Blocks of one motion depend on each other a little; errors may be larger than they are said "
+    "to be.",
+]
 
 
 @dataclass(frozen=True)
@@ -109,15 +114,6 @@ def _compare(
     )
 
 
-def write(folder: Path, runs: Sequence[ComparedRun]) -> None:
-    """Writes runs.md and runs.json into a folder, which is made if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    numbers = json.dumps([asdict(run) for run in runs], indent=2)
-    files.write_text(folder / NUMBERS, numbers + "\n")
-    parts = ["# Runs compared", markdown(table(runs)), explanation()]
-    files.write_text(folder / TABLE, "\n\n".join(parts) + "\n")
-
-
 def table(runs: Sequence[ComparedRun]) -> Table:
     """A row for each run, the best first; a column for each clip if there are several."""
     clips = list(runs[0].clips)
@@ -141,10 +137,11 @@ def explanation() -> str:
     )
 
 
-def write_page(folder: Path, runs: Sequence[ComparedRun]) -> None:
-    """Writes the page into the folder of a comparison of runs, the best run first."""
+def document(runs: Sequence[ComparedRun]) -> Document:
+    """What a comparison of runs says, the best run first."""
     tied = undecided(runs)
-    StudyPage(
+    return Document(
+        file=TABLE,
         kind="Sampled fits to the same motion, by what they predict",
         title="Runs compared",
         verdict="Undecided" if tied else "Decided",
@@ -153,25 +150,13 @@ def write_page(folder: Path, runs: Sequence[ComparedRun]) -> None:
         sections=[
             Section(
                 "What the runs predict",
-                [Grid(table(runs), "Runs"), Text(explanation())],
+                [Grid(table(runs), "Runs"), Text(explanation(), brief=True)],
             ),
-            Section(
-                "Limits of the data",
-                [
-                    Points(
-                        [
-                            "The order is that of these runs on this motion: the best of them may "
-                            "still not fit it, which the page of its run says.",
-                            "Blocks of one motion depend on each other a little; errors may be "
-                            "larger than they are said to be.",
-                        ]
-                    )
-                ],
-            ),
+            Section("Limits of the data", [Points(LIMITS)]),
         ],
         asked=[["Runs", ", ".join(f"`{run.name}`" for run in runs)]],
-        files=FILES,
-    ).write(folder)
+        files={NUMBERS: "all numbers"},
+    )
 
 
 def undecided(runs: Sequence[ComparedRun]) -> list[ComparedRun]:
@@ -235,9 +220,8 @@ def compare_runs(
     with output_folder(output) as folder:
         with activity.announced(f"Comparing {len(runs)} runs"):
             compared = compare_posteriors([Path(run) for run in runs])
-            if folder is not None:
-                write(folder, compared)
-                write_page(folder, compared)
-        log(joined([aligned(table(compared)), explanation()], apart=True))
-        log_output(log, folder, TABLE)
+        if folder is not None:
+            numbers = json.dumps([asdict(run) for run in compared], indent=2)
+            files.write_text(folder / NUMBERS, numbers + "\n")
+        publish(log, folder, document(compared))
         return compared
