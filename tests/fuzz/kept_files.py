@@ -22,7 +22,7 @@ from fitting.studies import ablation
 from fitting.studies.ablation import Row
 from fitting.studies.calibrate import calibration
 from fitting.studies.calibrate.replicates import DRAWS, LEVELS
-from fitting.studies.population import kept_searches
+from fitting.studies.population import population
 from support.curves import curve_problem
 
 SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)
@@ -92,7 +92,7 @@ def found_text() -> bytes:
 
 def load_found(path: Path) -> None:
     """As `jaxik population` reads it."""
-    found = kept_searches._read(path, 2)
+    found = population._read_found(path, 2)
     assert found is not None and np.isfinite([*found["u"], found["cost"]]).all()
 
 

@@ -23,7 +23,7 @@ from fitting.studies.fit import assess, fit_jobs, run_folder
 from fitting.studies.fit.fit import Fit
 from fitting.studies.many import many_tasks
 from fitting.studies.many.many_tasks import plan
-from fitting.studies.population import kept_searches
+from fitting.studies.population import population
 from support import runs, small_studies
 from support.experiments import ROOT, write
 from support.small_studies import HALF_SECOND, ONE_START, TWO_HALF_SECONDS, kept
@@ -72,7 +72,7 @@ STUDIES = {
     "population": Study(
         small_studies.quick_population,
         "",
-        [Stop(kept_searches, SEARCH, 6, "searches/*.json", 5)],
+        [Stop(population, SEARCH, 6, "searches/*.json", 5)],
         2,
         "searches/*.part",
     ),

@@ -17,7 +17,7 @@ from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import NoiseOptions
 from fitting.report import document, pages
-from fitting.studies.population import kept_searches, population_report
+from fitting.studies.population import population, population_report
 from fitting.studies.population.population import Population, clip_names
 from jaxik.maths import parameter_tree
 from support import small_studies
@@ -95,14 +95,14 @@ def test_a_subject_that_others_show_is_expected_as_they_show_it(tmp_path, monkey
 
 def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
     estimated: list[int] = []
-    search = kept_searches.search_with_noise
+    search = population.search_with_noise
 
     def watched(problem, experiment, progress, kept):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
         quiet = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
         return search(problem, quiet, progress, kept)
 
-    monkeypatch.setattr(kept_searches, "search_with_noise", watched)
+    monkeypatch.setattr(population, "search_with_noise", watched)
     rest, out = VARYING.replace(GIVEN, '[noise]\nsigmas = "estimated"\n'), tmp_path / "out"
     path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
     fitted = fitting.population(path, out)
@@ -129,7 +129,7 @@ def test_only_other_settings_are_searched_anew(made, tmp_path, monkeypatch, undr
         searched.append(name)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(kept_searches.KeptSearches, "_search", watched)
+    monkeypatch.setattr(population.Searches, "_search", watched)
     with pytest.raises(KeyboardInterrupt):
         fitting.population(write_population(tmp_path, top="seed = 1"), out)
     assert searched == ["uneven_walk from 0 s"]

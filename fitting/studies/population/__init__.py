@@ -1,5 +1,4 @@
 """Fits of several clips and subjects: each alone, pooled, and as a population of a mixed model.
 
-`population` computes them, `kept_searches` keeps those of subjects, `population_report` says and
-shows what they found.
+`population` computes them, `population_report` says and shows what they found.
 """

@@ -29,8 +29,7 @@ from fitting.studies.fit import run_folder
 from fitting.studies.fit.sentences import listed
 from fitting.studies.output import Log, output_folder, publish, silent
 
-from .kept_searches import Found
-from .population import Estimate, ParameterEstimates, Population, fit_clips_and_population
+from .population import Estimate, Found, ParameterEstimates, Population, fit_clips_and_population
 
 NUMBERS, SUMMARY, FIGURE = "population.json", "summary.md", "population.png"
 FEW = 5  # clips or subjects, from which little is known of a spread
