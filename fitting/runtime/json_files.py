@@ -8,7 +8,7 @@ import dataclasses
 import json
 import math
 import types
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from pathlib import Path
 from typing import (
     Annotated,
@@ -60,8 +60,12 @@ class JsonFile(Generic[Stored]):
         """Writes a file, its version first."""
         write_json(path, content, self.version, self.indent)
 
-    def read(self, path: Path) -> Stored:
+    def read(self, path: Path, check: Callable[[Stored], object] = lambda content: None) -> Stored:
         """What a file holds, its version left out.
+
+        Args:
+            path: of the file.
+            check: raises ValueError where what it holds contradicts itself.
 
         Raises:
             ValueError: it cannot be read, holds something else, or has a version that is not known;
@@ -75,9 +79,11 @@ class JsonFile(Generic[Stored]):
         version = content.pop(FORMAT, 0) if isinstance(content, dict) else 0
         check_version(path, version, self.version)
         try:
-            return checked(content, self.content, None if version else self.essential)
+            stored = checked(content, self.content, None if version else self.essential)
+            check(stored)
         except ValueError as error:
             raise self._refusal(path, str(error)) from None
+        return stored
 
     def _refusal(self, path: Path, problem: str) -> ValueError:
         return ValueError(f"{path}: not {self.description}: {problem}; {self.advice}")

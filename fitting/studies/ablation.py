@@ -59,6 +59,7 @@ from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
+from fitting.runtime.store import Store
 from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
@@ -156,7 +157,7 @@ def fit_variants(
     for name, variant in variants.items():
         with error_context(name):
             _check(variant)
-    finished = {} if folder is None else {row.key: row for row in read(folder)}
+    finished = {row.key: row for row in read(folder)}
     with activity.announced("Reading the clips"):
         data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
     splits = list(split(experiment.clips, data, folds))
@@ -345,18 +346,18 @@ def _key(variant: Experiment, split_name: str, content: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def read(folder: Path) -> list[Row]:
+def read(folder: Path | None) -> list[Row]:
     """The rows that a folder holds; none if it has no `contribution.json`.
 
     Raises:
         ValueError: the file is something else.
     """
-    path = folder / NUMBERS
-    if not path.exists():
-        return []
-    stored = ROWS_FILE.read(path)["rows"]
-    with error_context(f"{path}: not {ROWS_FILE.description}"):
-        return [_row(fields) for fields in stored]
+    stored = Store(ROWS_FILE, folder, check=_rows).recall(NUMBERS)
+    return [] if stored is None else _rows(stored)
+
+
+def _rows(stored: Rows) -> list[Row]:
+    return [_row(fields) for fields in stored["rows"]]
 
 
 def _row(stored: StoredRow) -> Row:
@@ -366,13 +367,10 @@ def _row(stored: StoredRow) -> Row:
 
 
 def _write(folder: Path | None, rows: Sequence[Row]) -> None:
-    if folder is None:
-        return
     content = [asdict(row) for row in rows]
     for row in content:  # JSON has no NaN
         row["agreement"] = {k: None if math.isnan(v) else v for k, v in row["agreement"].items()}
-    folder.mkdir(parents=True, exist_ok=True)
-    ROWS_FILE.write(folder / NUMBERS, {"rows": content})
+    Store(ROWS_FILE, folder).keep(NUMBERS, {"rows": content})
 
 
 def row_text(row: Row) -> str:
