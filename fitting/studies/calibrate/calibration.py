@@ -27,6 +27,7 @@ from fitting.inference.sample.posterior import SamplingProgress
 from fitting.problem.problem import Problem, digest
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
+from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, error_context
 from fitting.studies.translation import NamedSystem
 
@@ -224,18 +225,17 @@ class _Stage:
             arguments: of each replicate.
             on_result: called with each new result.
         """
-        results: dict[int, Result] = {}
-        for number in range(self.replicates):
-            if self.folder is not None and self._path(number).exists():
-                results[number] = self._read(number)
+        other = f"not {WRITER}: it is of replicate {{number}}"
+        store: Store[Any] = Store(FILES[self.name], self.folder, other, self._check)
+        paths = [f"{self.name}/{number:04}.json" for number in range(self.replicates)]
+        stored = [store.recall(path, {"number": number}) for number, path in enumerate(paths)]
+        results: dict[int, Result] = {n: row for n, row in enumerate(stored) if row is not None}
         missing = [number for number in range(self.replicates) if number not in results]
         computed = self._compute_here if self.client is None else self._compute_on_cluster
         title = f"Making the {WORDS[self.name]} of {self.replicates} replicates"
         with activity.announced(title, self.replicates, done=len(results)) as making:
             for number, result in computed(make, arguments, missing):
-                if self.folder is not None:
-                    self._path(number).parent.mkdir(parents=True, exist_ok=True)
-                    FILES[self.name].write(self._path(number), result)
+                store.keep(paths[number], result)
                 results[number] = result
                 on_result(result)
                 making.advance()
@@ -282,23 +282,14 @@ class _Stage:
 
         return report
 
-    def _path(self, number: int) -> Path:
-        assert self.folder is not None
-        return self.folder / self.name / f"{number:04}.json"
-
-    def _read(self, number: int) -> Any:
-        path = self._path(number)
-        result: Any = FILES[self.name].read(path)
-        with error_context(f"{path}: not {WRITER}"):
-            if result["number"] != number:
-                raise ValueError(f"it is of replicate {result['number']}; {ADVICE}")
-            for key, names in self._names(result).items():
-                if sorted(names) != sorted(self.parameters):
-                    raise ValueError(f"{key} has {names}; wanted {self.parameters}; {ADVICE}")
-            sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
-            if len(set(sizes.values())) > 1:
-                raise ValueError(f"its lists have different lengths, {sizes}; {ADVICE}")
-        return result
+    def _check(self, result: Mapping[str, Any]) -> None:
+        """Raises ValueError for a result of other parameters, or one that contradicts itself."""
+        for key, names in self._names(result).items():
+            if sorted(names) != sorted(self.parameters):
+                raise ValueError(f"{key} has {names}; wanted {self.parameters}")
+        sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
+        if len(set(sizes.values())) > 1:
+            raise ValueError(f"its lists have different lengths, {sizes}")
 
     def _names(self, result: Mapping[str, Any]) -> dict[str, list[str]]:
         """The parameters of which a result says something, in each of its parts."""
@@ -314,21 +305,12 @@ def _claim(folder: Path, own: Identity) -> None:
     Raises:
         ValueError: the folder is that of another calibration, or of something else.
     """
-    path = folder / IDENTITY
-    if not path.exists():
-        if folder.is_dir() and any((folder / name).exists() for name in FILES):
-            raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
-        folder.mkdir(parents=True, exist_ok=True)
-        IDENTITY_FILE.write(path, own)
-        return
-    present = IDENTITY_FILE.read(path)
-    keys = dict.fromkeys([*own, *present])
-    changed = [key for key in keys if key != "name" and own.get(key) != present.get(key)]
-    if changed:
-        raise ValueError(
-            f"{folder}: holds the calibration of {present['name']!r}, which differs from "
-            f"{own['name']!r} in: {', '.join(changed)}; name another folder"
-        )
+    if not (folder / IDENTITY).exists() and any((folder / name).exists() for name in FILES):
+        raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
+    other = "holds the calibration of {name!r}, which differs from this one in: {changed}"
+    key = {**own, "truth": own.get("truth")}
+    del key["name"]
+    Store(IDENTITY_FILE, folder, other).remember(IDENTITY, lambda: own, key)
 
 
 def _identity(
