@@ -75,7 +75,8 @@ class PitchRollFoot(AbstractAnimatedFoot):
 
     Limits are joint angles against the shin: 0 is a foot perpendicular to it, a positive pitch
     lifts the toes and a positive roll the outer edge, so that one pair of roll limits serves both
-    sides. They limit what the ground adds: an animation beyond its limits stays as it is.
+    sides; a foot in the middle rolls as a left one. They limit what the ground adds: an animation
+    beyond its limits stays as it is.
     """
 
     max_pitch: Leaf = parameter(
@@ -113,11 +114,12 @@ class PitchRollFoot(AbstractAnimatedFoot):
         rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
-        outer = vec.scale(left, rig.side)
+        side = jnp.where(rig.side == 0, 1.0, rig.side)
+        outer = vec.scale(left, side)
         ahead = vec.across(sole, up, sensed.slope.forward_ws)
         right = vec.cross(ahead, up)
 
-        pitch, roll = vec.stacked_barrier(*ground_angles(sensed, ahead, right, rig.side))
+        pitch, roll = vec.stacked_barrier(*ground_angles(sensed, ahead, right, side))
         shin = vec.normalize(
             leg.pose.ankle.pos - leg.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
@@ -129,7 +131,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         pitch, roll = vec.stacked_barrier(pitch, roll)
         # A roll about the level axis before the pitch is a roll about the pitched axis after it.
         tilt = quat.multiply(
-            quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, roll * rig.side)
+            quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, roll * side)
         )
         lost = jnp.abs(pitch - wanted_pitch) + jnp.abs(roll - wanted_roll)
         unlimited = gate.below(lost, jnp.full_like(lost, SAME_ANGLE), band=ANGLE_BAND)

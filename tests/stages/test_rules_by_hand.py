@@ -19,13 +19,14 @@ from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.lock import OffsetLock, PlantLock
 from jaxik.stages.lock.offset import LockState
 from jaxik.stages.pelvis import PelvisState
+from jaxik.stages.probe import swing
 from jaxik.stages.target import SlopeTarget, TargetState
 from jaxik.world.frame import Contact, Foothold, GroundHits, Sensed
 from jaxik.world.skeleton import Still, Transform
 from jaxik.world.terrain import Hit, Terrain
 from support import clips
 from support.cases import QUICK, RIG
-from support.clips import animate, assert_close, at, to_frames, to_ik, to_rig, to_terrain
+from support.clips import animate, assert_close, at, planes, to_frames, to_ik, to_rig, to_terrain
 from support.fragments import fragment
 
 LEVEL = to_terrain(clips.FLAT)
@@ -228,3 +229,30 @@ def test_a_foot_tilts_no_further_than_its_joint_and_stays_where_that_is_beyond_a
     tilt = jnp.array([0.2, -0.2, 0.5, -0.9, 0.3, -0.3])
     limited = foot.limit_tilt(tilt, joint, jnp.full(6, -0.5), jnp.full(6, 0.4), HARD)
     np.testing.assert_allclose(limited, [0.2, -0.2, 0.3, -0.6, 0.0, 0.0], rtol=0, atol=1e-12)
+
+
+def test_a_foot_in_the_middle_rolls_onto_the_ground_as_far_as_the_others():
+    frames, slope = to_frames(animate(RIG, count=1)), to_terrain(planes((0.0, 0.1, 0.0)))
+
+    def run(side: jax.Array) -> jax.Array:
+        rig = dataclasses.replace(to_rig(RIG), side=side)
+        return jaxik.run(to_ik({}), rig, slope, frames).corrections.ankle
+
+    sides = jnp.array([[1.0, -1.0], [0.0, 0.0]])
+    both, middle = np.asarray(jax.jit(jax.vmap(run), compiler_options=QUICK)(sides))
+    assert np.abs(both[..., 1:]).max() > 0.03, "feet roll"
+    np.testing.assert_allclose(middle, both, atol=1e-6)
+
+
+# Curves.
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_curve_of_a_swing_has_finite_slopes_from_its_first_instant_to_its_last(dtype):
+    fraction = jnp.array([0.0, 1e-38, 1e-30, 1e-12, 1e-6, 0.25, 0.5, 1.0 - 6e-8, 1.0], dtype)
+    for steepness in (1.0, 2.2, 10.0):
+        k = jnp.asarray(steepness, dtype)
+        slopes = jax.vmap(jax.grad(swing.s_curve, (0, 1)), (0, None))(fraction, k)
+        assert all(np.isfinite(slope).all() for slope in slopes), steepness
+        value = swing.s_curve(fraction, k)
+        assert (value[0], value[6], value[-1]) == (0.0, 0.5, 1.0) and (np.diff(value) >= 0).all()

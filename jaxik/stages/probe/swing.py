@@ -17,6 +17,7 @@ from .limits import AbstractLimitedProbe, least_rise
 HEIGHT_BAND = 0.01  # m
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
 FAR = 1e6  # m, beyond any ground
+FIRST = 1e-12  # of a swing, in which nothing has moved yet
 SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0.2 of it aside
 # When a swing changes most, as a fraction of it: measured on people who walk over blocks.
 HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
@@ -312,9 +313,10 @@ class AbstractSwingProbe(AbstractLimitedProbe):
 
 def s_curve(fraction: Array, steepness: Array) -> Array:
     """Curve from 0 to 1 with slope `steepness` in the middle: `1 / (1 + (1/x - 1)^k)`."""
-    inside = (fraction > 0) & (fraction < 1)
+    inside = (fraction > FIRST) & (fraction < 1)
     x = jnp.where(inside, fraction, 0.5)
-    odds = jnp.exp(steepness * (jnp.log1p(-x) - jnp.log(x)))
+    # Beyond e^80 odds are infinite in 32 bits, and their derivative is not a number.
+    odds = jnp.exp(jnp.minimum(steepness * (jnp.log1p(-x) - jnp.log(x)), 80.0))
     return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))
 
 

@@ -254,7 +254,7 @@ def turn_foot(foot: Foot, leg: Solved, rot_ws: Array, forward: Array) -> Array:
     foot_forward = rotate(foot_rot, maths.Z)
     heading = unit(across(foot_forward, up), forward)
     right = cross(heading, up)
-    side = float(foot.rig.side[foot.index])
+    side = float(foot.rig.side[foot.index]) or 1.0
     lateral = -side * right
     shin = unit(rotate(world_from_model, leg.ankle.pos - leg.knee.pos), -up)
 
@@ -266,10 +266,9 @@ def turn_foot(foot: Foot, leg: Solved, rot_ws: Array, forward: Array) -> Array:
 
     pitch, roll = _ground_angles(foot, heading, right, lateral)
     tilt = maths.from_axis_angle(right, limited("pitch", foot_forward, pitch))
-    if side != 0.0:
-        roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
-        angle = limited("roll", side * rotate(foot_rot, maths.X), roll)
-        tilt = multiply(maths.from_axis_angle(roll_axis, angle), tilt)
+    roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
+    angle = limited("roll", side * rotate(foot_rot, maths.X), roll)
+    tilt = multiply(maths.from_axis_angle(roll_axis, angle), tilt)
     wanted = multiply(maths.inverse(world_from_model), multiply(tilt, rot_ws))
     return maths.nlerp(leg.ankle.rot, wanted, foot.weight)
 
