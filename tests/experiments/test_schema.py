@@ -283,7 +283,7 @@ def test_every_key_has_a_meaning_a_parameter_its_range_and_the_defaults_are_thos
 
 
 def test_the_page_on_experiment_files_names_every_key():
-    page = (ROOT / "fitting" / "README.md").read_text(encoding="utf-8")
+    page = (ROOT / "fitting" / "experiment" / "README.md").read_text(encoding="utf-8")
     section = page.partition("\n## Experiment files\n")[2].partition("\n## Parameter files\n")[0]
     for table in KEYS.keys() - {"search", "sample"}:  # which `jaxik schema` lists
         for key in KEYS[table]:

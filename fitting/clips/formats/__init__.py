@@ -6,8 +6,8 @@ what each field holds. A reader raises `ValueError` with the path, and for a tex
 number, where the file is not what its suffix promises. `bvh.read_bvh` is a complete example.
 
 The suffix and the function go into `READERS` below; `load_clip`, its messages and every command
-that takes a clip then accept the format. "How to add a clip format" in fitting/README.md has all
-steps, with an example.
+that takes a clip then accept the format. "How to add a clip format" in fitting/clips/README.md has
+all steps, with an example.
 
 `saving.save_clip` writes clips, as `npz` or by the modules named `writer`.
 
