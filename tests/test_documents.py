@@ -184,6 +184,16 @@ def test_the_files_and_names_in_all_pages_exist():
     assert not missing
 
 
+def test_pages_are_short_and_begin_with_a_picture_or_an_example():
+    texts = {name_of(path): text for path, text in TEXTS.items() if path in PAGES}
+    del texts["CHANGELOG.md"]
+    words = {name: len(text.split()) for name, text in texts.items()}
+    assert not {name: count for name, count in words.items() if count > 2500}
+    assert sum(words.values()) <= 20_000, words
+    begins = re.compile(r"# .*\n\n(?:!\[|```)")
+    assert not [name for name, text in texts.items() if not begins.match(text)]
+
+
 def test_no_file_cites_a_page_that_is_not_in_the_repository():
     pages = {page.name for page in PAGES} | WRITTEN_PAGES
     cited = {path: set(re.findall(r"[\w-]+\.md\b", text)) - pages for path, text in TEXTS.items()}
