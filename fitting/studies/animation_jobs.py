@@ -13,7 +13,7 @@ from fitting.clips import Clip, flight, save_clip
 from fitting.clips.formats.saving import check_clip_file
 from fitting.ground.meshes import mesh_of
 from fitting.motion import accuracy
-from fitting.report.formatting import aligned, joined, transposed
+from fitting.report.formatting import aligned, joined
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64, with_floats
 
@@ -21,7 +21,7 @@ from . import animations, comparison, comparison_report, suite, suite_report
 from .animations import AnimationFiles, load_animation
 from .comparison import Comparison
 from .fit import fit_tables, run_folder
-from .output import Log, log_output, output_folder, silent
+from .output import Log, output_folder, publish, silent
 from .suite import Plan, Suite, SystemsOf
 
 
@@ -46,9 +46,12 @@ def compare(
         log: called with what the command line prints.
 
     Raises:
-        ValueError: a file cannot be read, a system does not fit the clip or gives poses that are
-            not finite, a rate is above the clip's, or the folder cannot be made.
+        ValueError: there is no system, a file cannot be read, a system does not fit the clip or
+            gives poses that are not finite, a rate is above the clip's, or the folder cannot be
+            made.
     """
+    if not systems:
+        raise ValueError("systems is empty; wanted one or more")
     with output_folder(output) as folder:
         systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
         title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
@@ -56,17 +59,7 @@ def compare(
         compared = comparison.compare(systems, loaded, title=title, during=during)
         differences = animations.measure(systems, loaded, rates, during)
         compared = dataclasses.replace(compared, rates=differences)
-        if folder is not None:
-            with activity.announced("Drawing the comparison"):
-                comparison_report.write(folder, compared)
-                comparison_report.write_page(folder, compared)
-        table = aligned(transposed(comparison_report.table(compared)))
-        where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
-        where += [f"note: {remark}" for remark in loaded.clip.remarks]
-        log(joined([table, "", *filter(None, where)]))
-        if differences:
-            log(joined(["", aligned(comparison_report.rate_table(compared))]))
-        log_output(log, folder, comparison_report.TABLE)
+        publish(log, folder, comparison_report.document(compared))
         for name, (placement, cause) in compared.placements.items():
             animations.warn(placement, cause, name)
         return compared
@@ -100,12 +93,7 @@ def run_suite(
         finished = suite.run_suite(systems_of, plan, during=during)
         if finished.interrupted:
             log("interrupted; drawing and writing the finished situations")
-        if folder is not None:
-            with activity.announced("Drawing the situations"):
-                suite_report.write(folder, finished)
-                suite_report.write_page(folder, finished)
-        log(suite_report.text(finished))
-        log_output(log, folder, suite_report.TABLE)
+        publish(log, folder, suite_report.document(finished))
         return finished
 
 

@@ -3,8 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,30 +20,22 @@ from fitting.motion.measures import (
     Measures,
     Placement,
 )
-from fitting.report import motion_data, pages, style
-from fitting.report.formatting import (
-    MEASURES,
-    Table,
-    explanations,
-    headings,
-    markdown,
-    meanings,
-    percent,
-    transposed,
-)
-from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
-from fitting.report.pages import (
+from fitting.report import motion_data
+from fitting.report.document import (
     Block,
+    Document,
     Finding,
     Grid,
     Jump,
+    Plot,
     Points,
     Section,
-    StudyPage,
     Terms,
     Text,
     View,
 )
+from fitting.report.formatting import MEASURES, Table, headings, meanings, percent, transposed
+from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
 from fitting.report.style import (
     BEFORE,
     CAPTURED,
@@ -56,8 +47,6 @@ from fitting.report.style import (
     styled,
     whole_and_part,
 )
-from fitting.runtime import files
-from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64
 
 from . import comparison as compare_comparison
@@ -83,23 +72,8 @@ Dashes: TypeAlias = Literal["-", "--", ":"]
 DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
 BAR_PANELS = 5  # in a row
 
-
-FILES = {
-    TABLE: "the tables",
-    NUMBERS: "all numbers",
-    FIGURE: "the figure",
-}
-
 RADIUS = 0.018  # m, of the bones of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has
-
-
-def write(folder: Path, comparison: Comparison) -> None:
-    """Writes compare.md, compare.json and compare.png into a folder, which is made if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    style.save(folder / FIGURE, overview(comparison))
-    write_json(folder / NUMBERS, _numbers(comparison))
-    files.write_text(folder / TABLE, _summary(comparison))
 
 
 def table(comparison: Comparison) -> Table:
@@ -122,7 +96,7 @@ def rate_table(comparison: Comparison) -> Table:
     ]
 
 
-def _numbers(comparison: Comparison) -> dict[str, object]:
+def _numbers(comparison: Comparison) -> dict[str, Any]:
     """The content of compare.json: SI units, radians and fractions of 1; null for NaN."""
     return {
         "title": comparison.title,
@@ -136,29 +110,6 @@ def _numbers(comparison: Comparison) -> dict[str, object]:
         ],
         "rates": [asdict(row) for row in comparison.rates],
     }
-
-
-def _summary(comparison: Comparison) -> str:
-    count = len(comparison.ground)
-    parts = [
-        f"# {comparison.title}",
-        f"{count} frames, {(count - 1) / comparison.fps:.2f} s at {comparison.fps:g} Hz. "
-        f"`{ANIMATED}` is the animation without foot IK, on its flat floor.",
-        markdown(table(comparison)),
-        f"![Feet and pelvis over the ground, and the measures]({FIGURE})",
-        "## What the columns mean",
-        explanations(MEASURES),
-        "Presets that leave the character's height to their game (`unreal`, `mec`) have the root "
-        "on the ground below it, unless `--root animation` was given.",
-        "A foot stands where the animation says so: by its contact labels or, without them, by its "
-        "motion. The ground under a point is what a ray from above meets first.",
-    ]
-    if comparison.rates:
-        parts += ["## At other frame rates", RATES, markdown(rate_table(comparison))]
-    if comparison.groundless:
-        fraction = percent(comparison.groundless)
-        parts.append(f"{fraction} of the soles' points have no ground under them and are left out.")
-    return "\n\n".join(parts) + "\n"
 
 
 class LineStyle(TypedDict):
@@ -259,15 +210,16 @@ def _bars(
 
 
 @in_float64
-def write_page(folder: Path, comparison: Comparison) -> None:
-    """Writes the page into the folder of a comparison, whose figure is there."""
+def document(comparison: Comparison) -> Document:
+    """What a comparison says."""
     compared = compare_comparison.of_comparison(comparison)
     systems = tuple(comparison.placements)
     placements = {name: compared.motions[name].placement for name in systems}
     failing = beyond(placements)
     worst = max(systems, key=lambda name: faults(placements[name])[0].excess)
     visible = compared.motions[ANIMATED].placement.visible
-    StudyPage(
+    return Document(
+        file=TABLE,
         kind="Foot IK systems compared on one clip",
         title=comparison.title,
         verdict=f"{len(failing)} of {len(systems)} beyond a limit"
@@ -277,61 +229,62 @@ def write_page(folder: Path, comparison: Comparison) -> None:
         findings=findings(comparison, compared),
         sections=[
             _placement(compared),
-            *_accuracy(compared),
-            _measures(folder, comparison),
-            *_rates(comparison),
+            Section(
+                "Beside the captured motion",
+                [
+                    Grid(fit_figures.accuracy_table(compared.accuracy), "Accuracy", brief=False),
+                    Text("Distances and angles are root mean squares."),
+                ]
+                if compared.accuracy
+                else [],
+            ),
+            _measures(comparison),
+            Section(
+                "At other frame rates",
+                [Text(RATES), Grid(rate_table(comparison), "Motion at other frame rates")]
+                if comparison.rates
+                else [],
+            ),
             _worst(comparison, compared),
             _limits(comparison, compared),
         ],
         asked=_asked(comparison),
-        files=FILES,
+        numbers={NUMBERS: _numbers(comparison)},
         view=View(
             [shown(compared, systems, watched=worst)],
             [comparison.title],
             f"{100 * visible:.2g} cm",
         ),
-    ).write(folder)
+    )
 
 
 def _placement(compared: ComparedMotions) -> Section:
     placements = {name: motion.placement for name, motion in compared.motions.items()}
     if compared.captured is not None:
         placements["captured"] = compared.captured.placement
-    table = fit_figures.placement_table(placements)
+    grid = Grid(fit_figures.placement_table(placements), "How feet are placed", brief=False)
     text = (
         "Share of the frames and, after the dot, the largest with its foot and frame. A slide or a "
         "pop counts by how far it exceeds that of the flat animation; frames count from 0."
     )
-    return Section("Feet on the ground", [Grid(table, "How feet are placed"), Text(text)])
+    return Section("Feet on the ground", [grid, Text(text)])
 
 
-def _accuracy(compared: ComparedMotions) -> list[Section]:
-    if not compared.accuracy:
-        return []
-    table = fit_figures.accuracy_table(compared.accuracy)
-    text = "Distances and angles are root mean squares."
-    return [Section("Beside the captured motion", [Grid(table, "Accuracy"), Text(text)])]
-
-
-def _measures(folder: Path, comparison: Comparison) -> Section:
-    grid = transposed(table(comparison))
+def _measures(comparison: Comparison) -> Section:
     caption = "Feet and pelvis over the ground, and the measures"
     return Section(
         "Measures",
         [
-            Grid(grid, "Measures of all systems"),
-            *pages.embed(folder, {FIGURE: caption}),
+            Grid(transposed(table(comparison)), "Measures of all systems"),
+            Plot(FIGURE, caption, lambda: overview(comparison)),
             Terms(meanings(MEASURES)),
+            Text(
+                f"`{ANIMATED}` is the animation without foot IK, on its flat floor. A foot stands "
+                "where the animation says so: by its contact labels or, without them, by its "
+                "motion. The ground under a point is what a ray from above meets first."
+            ),
         ],
     )
-
-
-def _rates(comparison: Comparison) -> list[Section]:
-    if not comparison.rates:
-        return []
-    table = rate_table(comparison)
-    grid = Grid(table, "Motion at other frame rates")
-    return [Section("At other frame rates", [Text(RATES), grid])]
 
 
 def _worst(comparison: Comparison, compared: ComparedMotions) -> Section:
@@ -356,7 +309,11 @@ def _limits(comparison: Comparison, compared: ComparedMotions) -> Section:
             "The captured motion is not known: figures say how feet stand on the ground, not "
             "whether people would move like this."
         )
-    lines.append(f"Root: {animation.root.reason}.")
+    if clip.fps > MAX_RATE:
+        lines.append(
+            f"The view shows {MAX_RATE:g} frames a second or fewer; all figures are of all frames, "
+            f"at {clip.fps:g} Hz."
+        )
     if clip.stance is None:
         lines.append("The clip has no contact labels; stances are found by its motion.")
     if comparison.groundless:
@@ -364,14 +321,15 @@ def _limits(comparison: Comparison, compared: ComparedMotions) -> Section:
             f"{percent(comparison.groundless)} of the soles' points have no ground under them and "
             "are left out."
         )
-    if in_the_air := flight.describe(animation.clip):
-        lines.append(f"{in_the_air.capitalize()}.")
-    if clip.fps > MAX_RATE:
-        lines.append(
-            f"The view shows {MAX_RATE:g} frames a second or fewer; all figures are of all frames, "
-            f"at {clip.fps:g} Hz."
-        )
-    return Section("Limits of the data", [Points([*lines, *clip.remarks])])
+    notes = [
+        f"Root: {animation.root.reason}. Presets that leave the character's height to their game "
+        "(`unreal`, `mec`) have it on the ground below it, unless `--root animation` was given."
+    ]
+    if in_the_air := flight.describe(clip):
+        notes.append(f"{in_the_air.capitalize()}.")
+    return Section(
+        "Limits of the data", [Points(lines), Points([*notes, *clip.remarks], brief=True)]
+    )
 
 
 def _asked(comparison: Comparison) -> Table:

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.inference.sample.posterior import Posterior
-from fitting.report.formatting import Table, interval, number, transposed
+from fitting.report.document import Document, Grid, Plot
+from fitting.report.formatting import Table, interval, number
 from fitting.runtime import display
 from jaxik.maths import parameter_tree
 
@@ -133,10 +134,17 @@ def posterior_html(posterior: Posterior) -> str:
 
 @display.html.register
 def comparison_html(comparison: Comparison) -> str:
-    """The measures of each system, and its motion."""
-    rows = transposed(comparison_report.table(comparison))
-    return page(
-        f"Comparison: {comparison.title}",
-        table(rows),
-        picture(comparison_report.overview(comparison), comparison.title),
-    )
+    """What it found, the measures of each system, and its motion."""
+    return document_html(comparison_report.document(comparison))
+
+
+def document_html(document: Document) -> str:
+    """The document in brief, with its plots."""
+    shown: list[Markup] = []
+    for block in document.blocks:
+        if isinstance(block, Grid) and block.brief:
+            shown.append(table(block.rows))
+        elif isinstance(block, Plot):
+            shown.append(picture(block.draw(), block.caption))
+    lines = [f"{document.verdict}.", *document.sentences]
+    return page(f"{document.kind}: {document.title}", sentences(lines), *shown)

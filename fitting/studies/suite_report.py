@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,21 +12,19 @@ from matplotlib.patches import Patch
 
 from fitting.ground import ground_path
 from fitting.motion.measures import VISIBLE
-from fitting.report import pages, style
-from fitting.report.formatting import (
-    Column,
-    Table,
-    aligned,
-    bullets,
-    explanations,
-    joined,
-    markdown,
-    meanings,
+from fitting.report.document import (
+    Document,
+    Finding,
+    Grid,
+    Plot,
+    Points,
+    Section,
+    Terms,
+    Text,
+    View,
 )
-from fitting.report.pages import Finding, Grid, Points, Section, StudyPage, Terms, Text, View
+from fitting.report.formatting import Column, Table, meanings
 from fitting.report.style import BEFORE, EARTH, GROUND, STAGES, earth, legend, styled
-from fitting.runtime import files
-from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64
 
 from . import comparison, comparison_report
@@ -80,29 +77,6 @@ JUMP = 1.0  # m in a frame, from which a line is interrupted
 HEAD = 0.5, 1.45  # place of a column's heading, in heights of a panel
 SAMPLES = 600  # of the ground
 
-FILES = {
-    TABLE: "the tables",
-    NUMBERS: "all numbers",
-    PAGE: "the pictures",
-}
-
-
-def write(folder: Path, suite: Suite) -> None:
-    """Writes suite.md, suite.json and suite.png into a folder, which is made if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / NUMBERS, _numbers(suite))
-    files.write_text(folder / TABLE, _summary(suite))
-    if suite.scenes:
-        style.save(folder / PAGE, page(suite))
-
-
-def text(suite: Suite) -> str:
-    """The table, the bounds, and how many cells are within them, for a terminal."""
-    parts: list[str] = [aligned(table(suite))] if suite.scenes else []
-    parts.append("\n".join([f"bounds ({MISS} is beyond them):", *reasons()]))
-    parts.append(count_text(suite))
-    return joined(parts, apart=True)
-
 
 def missed(suite: Suite) -> list[str]:
     """What is beyond its bound, a line each."""
@@ -112,31 +86,6 @@ def missed(suite: Suite) -> list[str]:
         for system in suite.systems
         for miss in misses(scene, system)
     ]
-
-
-def _summary(suite: Suite) -> str:
-    rows = [[_red(cell) for cell in row] for row in table(suite)]
-    lines = missed(suite)
-    parts = [
-        "# Suite of situations",
-        f"{count_text(suite).capitalize()}. Animations of "
-        f"{suite.plan.seconds:g} s on made grounds, every system with its defaults, the root "
-        "where `jaxik run` puts it.",
-        markdown(rows),
-        f"A mark ({MISS}) and red are beyond the bound in the row `{BOUND}`.",
-        f"![Each system in each situation, from the side]({PAGE})" if suite.scenes else "",
-        "## What the columns mean",
-        explanations(MEASURES),
-        "## Bounds",
-        bullets(reasons()),
-        "## Beyond their bounds",
-        bullets(lines) if lines else "Nothing.",
-    ]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _red(cell: str) -> str:
-    return f'<span style="color:red">**{cell}**</span>' if cell.endswith(MISS) else cell
 
 
 def _numbers(suite: Suite) -> dict[str, Any]:
@@ -214,17 +163,6 @@ def misses(scene: Scene, system: str) -> list[str]:
         for key, cell in outcome.cells.items()
         if not cell.is_within
     ]
-
-
-def count_text(suite: Suite) -> str:
-    """How many cells are within their bounds, and which situations are missing."""
-    within, count = suite.counts
-    text = f"{within} of {count} cells are within their bounds"
-    if suite.interrupted:
-        text += (
-            f"; interrupted after {len(suite.scenes)} of {len(suite.plan.situations)} situations"
-        )
-    return text
 
 
 def reasons() -> list[str]:
@@ -336,20 +274,38 @@ def _title(axes: Axes, missed: list[str]) -> None:
 
 
 @in_float64
-def write_page(folder: Path, suite: Suite) -> None:
-    """Writes the page into the folder of a suite, whose pictures are there."""
+def document(suite: Suite) -> Document:
+    """What a suite says."""
     within, count = suite.counts
-    StudyPage(
+    plots = [Plot(PAGE, "Each system in each situation, from the side", lambda: page(suite))]
+    return Document(
+        file=TABLE,
         kind="Foot IK systems in made situations",
         title="Suite of situations",
         verdict=f"{within} of {count} within bounds",
         good=within == count and not suite.interrupted,
         findings=findings(suite),
-        sections=[_cells(folder, suite), _bounds(), _missed(suite), _limits(suite)],
+        sections=[
+            Section(
+                "All situations",
+                [
+                    Text(
+                        f"What is marked ({MISS}) is beyond its bound, which stands in the first "
+                        "row of a situation."
+                    ),
+                    Grid(table(suite), "Measures of all systems in all situations"),
+                    *(plots if suite.scenes else []),
+                    Terms(meanings(MEASURES)),
+                ],
+            ),
+            Section("Bounds", [Points(reasons(), brief=True)]),
+            Section("Beyond their bounds", [Points(missed(suite) or ["Nothing."])]),
+            _limits(suite),
+        ],
         asked=_asked(suite),
-        files={name: words for name, words in FILES.items() if (folder / name).is_file()},
+        numbers={NUMBERS: _numbers(suite)},
         view=_view(suite) if suite.scenes else None,
-    ).write(folder)
+    )
 
 
 def findings(suite: Suite) -> list[Finding]:
@@ -418,29 +374,6 @@ def _view(suite: Suite) -> View:
     ]
     names = [scene.situation.name for scene in suite.scenes]
     return View(clips, names, f"{100 * VISIBLE:.2g} cm (of an adult)")
-
-
-def _cells(folder: Path, suite: Suite) -> Section:
-    caption = "Each system in each situation, from the side"
-    return Section(
-        "All situations",
-        [
-            Text(
-                "What is marked is beyond its bound, which stands in the first row of a situation."
-            ),
-            Grid(table(suite), "Measures of all systems in all situations"),
-            *pages.embed(folder, {PAGE: caption}),
-            Terms(meanings(MEASURES)),
-        ],
-    )
-
-
-def _bounds() -> Section:
-    return Section("Bounds", [Points(reasons())])
-
-
-def _missed(suite: Suite) -> Section:
-    return Section("Beyond their bounds", [Points(missed(suite) or ["Nothing."])])
 
 
 def _limits(suite: Suite) -> Section:

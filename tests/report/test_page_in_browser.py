@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 
 from fitting.report import pages
 from fitting.studies import comparison_report
@@ -45,8 +44,7 @@ def comparison_path(tmp_path_factory) -> Path:
     """The page of two systems that are 10 cm apart, the lower one watched."""
     folder = tmp_path_factory.mktemp("compared")
     compared = comparisons.invented_comparison(comparisons.walk())
-    Image.new("RGB", (1700, 900), "white").save(folder / comparison_report.FIGURE)
-    comparison_report.write_page(folder, compared)
+    comparison_report.document(compared).write(folder)
     return folder / pages.PAGE
 
 

@@ -420,10 +420,9 @@ def compared_motions(compared):
 
 
 def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
-    compared, compared_motions, tmp_path
+    compared, compared_motions, tmp_path, undrawn
 ):
-    Image.new("RGB", (1700, 900), "white").save(tmp_path / comparison_report.FIGURE)
-    comparison_report.write_page(tmp_path, compared)
+    comparison_report.document(compared).write(tmp_path)
     page = Page(tmp_path / pages.PAGE)
     assert page.text.startswith(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "

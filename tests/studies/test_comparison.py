@@ -147,13 +147,16 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
     middle = float(np.median(walk.joints_ws(2)[..., 2]))
     corners = np.array([[-9.0, 0.0, middle], [9.0, 0.0, middle], [0.0, 0.0, middle - 99.0]])
     triangle = np.array([[0, 1, 2]])
-    half = comparison.compare({}, Animation(walk, terrain.mesh(corners, triangle)), title="half")
+    systems = {"ozz": preset_system("ozz")}
+    half = comparison.compare(
+        systems, Animation(walk, terrain.mesh(corners, triangle)), title="half"
+    )
     assert 0.3 < half.groundless < 0.7 and np.isnan(half.ground).any()
     assert np.isfinite(half.measures[comparison.ANIMATED].clearance)
-    comparison_report.write(tmp_path, half)
+    comparison_report.document(half).write(tmp_path)
     assert "have no ground under them" in (tmp_path / comparison_report.TABLE).read_text()
-    none = comparison.compare({}, Animation(walk, terrain.mesh(corners - 999.0, triangle)))
-    comparison_report.write(tmp_path, none)
+    none = comparison.compare(systems, Animation(walk, terrain.mesh(corners - 999.0, triangle)))
+    comparison_report.document(none).write(tmp_path)
     assert numbers(tmp_path)[comparison.ANIMATED]["clearance"] is None
 
 
@@ -169,22 +172,25 @@ def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
     labels = [skeleton["label"] for skeleton in clip["skeletons"]]
     assert clip["frames"] == 61 and labels == ["flat animation", "still", "record"]
     text, systems = table.read_text(), numbers(folder)
-    assert text.startswith("# walk.npz on uneven_walk.ply\n\n61 frames, 2.00 s at 30 Hz.")
+    assert text.startswith(
+        "# walk.npz on uneven_walk.ply\n\nFoot IK systems compared on one clip: "
+    )
+    assert "- **Frames**: 61, 2.00 s at 30 Hz\n" in text
     assert f"]({figure.name})" in text and "have no ground" not in text
     for column in MEASURES.values():
-        assert f"- **{column.heading}** ({column.unit}): {column.meaning}" in text
-    rows = [line for line in text.splitlines() if line.startswith("| ")]
-    for row, (name, system) in zip(rows[2:], systems.items(), strict=True):
-        values = [np.nan if value is None else value for value in system.values()]
-        cells = [MEASURES[key].format(value) for key, value in zip(MEASURES, values, strict=True)]
-        assert row == "| " + " | ".join([name, *cells]) + " |"
+        assert f"- **{column.heading} ({column.unit})**: {column.meaning}" in text
+    for key, column in MEASURES.items():
+        values = [np.nan if system[key] is None else system[key] for system in systems.values()]
+        cells = [f"{column.heading}, {column.unit}", *map(column.format, values)]
+        assert "| " + " | ".join(cells) + " |\n" in text
     assert all(pixels > 1000 for pixels in struct.unpack(">II", figure.read_bytes()[16:24]))
 
 
 def test_the_terminal_shows_the_table_and_warnings(compared):
-    assert compared.out.splitlines()[0].split() == ["system", "as", "animated", "still", "record"]
+    headings = [line.split() for line in compared.out.splitlines() if line.startswith("system")]
+    assert headings == [["system", "as", "animated", "still", "record"]]
     assert f"read {compared.folder / comparison_report.TABLE}" in compared.out
-    assert "\nroot: as animated: the ground is " in compared.out
+    assert "\n- Root: as animated: the ground is " in compared.out
     lines = compared.err.splitlines()
     assert lines and all(line.startswith(("jaxik: record: ", "jaxik: still: ")) for line in lines)
 
