@@ -167,7 +167,7 @@ class Document:
         for plot in self.plots:
             style.save(folder / plot.name, plot.draw())
         files.write_text(folder / self.file, markdown(self))
-        pictures = pages.pictures(folder, {plot.name: plot.caption for plot in self.plots})
+        pictures = pages.embed(folder, {plot.name: plot.caption for plot in self.plots})
         spent = sum(picture.size for picture in pictures.values())
         clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
         pages.write(

@@ -279,10 +279,3 @@ def headings(columns: Mapping[str, Column]) -> list[str]:
 def meanings(columns: Mapping[str, Column]) -> list[list[str]]:
     """What each column means: its heading with its unit, and a text."""
     return [[f"{column.heading} ({column.unit})", column.meaning] for column in columns.values()]
-
-
-def explanations(columns: Mapping[str, Column]) -> str:
-    """What each column means, as a Markdown list."""
-    return "\n".join(
-        f"- **{column.heading}** ({column.unit}): {column.meaning}" for column in columns.values()
-    )

@@ -1,15 +1,14 @@
-"""The page of a job other than a fit: sections of sentences, tables and pictures."""
+"""Pages as HTML: one file each, with styles, scripts and pictures in it."""
 
 import base64
 import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -18,9 +17,8 @@ from PIL import Image
 from fitting.experiment.experiment import ClipEntry, Experiment
 from fitting.runtime import files
 
-from . import motion_data, style
+from . import style
 from .formatting import Table
-from .motion_data import ShownClip
 
 PACKAGE = "fitting.report"
 PAGE = "report.html"  # in the folder of a run
@@ -118,22 +116,9 @@ class Picture(NamedTuple):
     height: int
     size: int
     """Bytes, before base64."""
-    kind: str = "picture"
 
 
-def embed(folder: Path, captions: Mapping[str, str]) -> list[Picture]:
-    """Pictures of a folder, those that are too large scaled down: all are `MAX_BYTES` at most.
-
-    Args:
-        folder: that has them, as PNG.
-        captions: by file name; files that do not exist are left out.
-    """
-    paths = [folder / name for name in captions if (folder / name).is_file()]
-    room = MAX_BYTES // max(len(paths), 1)
-    return [_embed(path, captions[path.name], room) for path in paths]
-
-
-def pictures(folder: Path, captions: Mapping[str, str]) -> dict[str, Picture]:
+def embed(folder: Path, captions: Mapping[str, str]) -> dict[str, Picture]:
     """Pictures of a folder, those that are too large scaled down: all are `MAX_BYTES` at most.
 
     Args:
@@ -155,117 +140,6 @@ def _embed(path: Path, caption: str, room: int) -> Picture:
             content = file.getvalue()
     encoded = base64.b64encode(content).decode("ascii")
     return Picture(caption, f"data:image/png;base64,{encoded}", *size, len(content))
-
-
-class Text(NamedTuple):
-    """A paragraph; what is `code` or **strong** in Markdown is so."""
-
-    text: str
-    kind: str = "text"
-
-
-class Points(NamedTuple):
-    """A list of sentences."""
-
-    lines: Sequence[str]
-    kind: str = "points"
-
-
-class Terms(NamedTuple):
-    """Names and what they mean."""
-
-    rows: Sequence[Sequence[str]]
-    kind: str = "terms"
-
-
-class Grid(NamedTuple):
-    """A table; a cell that ends with an exclamation mark is shown as a miss."""
-
-    rows: Table
-    label: str
-    """For those who do not see it."""
-    title: str = ""
-    kind: str = "grid"
-
-
-class Jump(NamedTuple):
-    """A button that shows the worst seconds of a motion in the view."""
-
-    words: str
-    clip: int
-    """Its number among the clips of the view, from 0."""
-    key: str
-    """Of the motion."""
-    kind: str = "jump"
-
-
-Block: TypeAlias = Text | Points | Terms | Grid | Jump | Picture
-
-
-class Finding(NamedTuple):
-    """A sentence that says what was found."""
-
-    text: str
-    bad: bool = False
-    """Whether it says what went badly."""
-
-
-class Section(NamedTuple):
-    """A heading, and what stands below it."""
-
-    heading: str
-    blocks: Sequence[Block]
-
-
-@dataclass(frozen=True)
-class View:
-    """The motion in 3-D."""
-
-    clips: Sequence[ShownClip]
-    names: Sequence[str]
-    """Of the clips."""
-    visible: str
-    """From which depth on a sole in the ground is marked, with its unit."""
-
-
-@dataclass(frozen=True)
-class StudyPage:
-    """All that a page says."""
-
-    kind: str
-    """What was done, in a few words."""
-    title: str
-    verdict: str
-    """In two or three words."""
-    good: bool
-    """Whether the verdict is good news."""
-    findings: Sequence[Finding]
-    """Three; the page begins with those that say what went badly."""
-    sections: Sequence[Section]
-    asked: Table
-    """What was asked, a name and a text each."""
-    files: Mapping[str, str] = field(default_factory=dict)
-    """What is in which file beside the page, by file name."""
-    view: View | None = None
-
-    def write(self, folder: Path) -> None:
-        """Writes the page into a folder."""
-        pictures = [
-            block
-            for section in self.sections
-            for block in section.blocks
-            if isinstance(block, Picture)
-        ]
-        spent = sum(picture.size for picture in pictures)
-        clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
-        write(
-            folder / PAGE,
-            "study.html",
-            clips,
-            page=self,
-            title=self.title,
-            findings=[f.text for f in sorted(self.findings, key=lambda f: not f.bad)],
-        )
 
 
 def system(experiment: Experiment) -> str:

@@ -22,7 +22,7 @@ from fitting.motion.playback import RESIDUAL_KINDS
 from fitting.motion.worst_window import find_worst_window
 from fitting.problem.scene import legs_ws
 from fitting.report import formatting, motion_data, pages
-from fitting.report.pages import Finding, Grid, Section, StudyPage, Text
+from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.style import save
 from fitting.studies import animations, comparison, comparison_report
 from fitting.studies.fit import fit_motions, fit_page, fit_plots, identifiability_report, sentences
@@ -479,14 +479,18 @@ def test_the_worst_fault_is_named_and_no_system_praised_that_is_worse_than_the_a
     assert last.bad and last.text.startswith("No system comes closer to the captured motion")
 
 
-def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
-    StudyPage(
+def test_what_went_badly_comes_first_and_what_says_nothing_is_left_out(tmp_path):
+    Document(
+        file="summary.md",
         kind="a test",
         title=HOSTILE,
         verdict="bad",
         good=False,
         findings=[Finding("good `a` **b**"), Finding("bad <i>", bad=True), Finding("good too")],
-        sections=[Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")])],
+        sections=[
+            Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")]),
+            Section("Nothing", [Grid([["x", "y"]], "none"), Points([]), Text("")]),
+        ],
         asked=[["What", HOSTILE]],
     ).write(tmp_path)
     page = Page(tmp_path / pages.PAGE)
@@ -494,15 +498,23 @@ def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
     assert "<li>good <code>a</code> <strong>b</strong></li>" in page.html
     assert '<td class="miss">2!</td>' in page.html and page.elements.count("script") == 2
     assert page.elements.count("canvas") == 0 and page.data == {"clips": []}
+    assert (
+        (tmp_path / "summary.md")
+        .read_text()
+        .startswith(
+            f"# {HOSTILE}\n\na test: **bad**.\n\n- bad <i>\n- good `a` **b**\n- good too\n\n## Table"
+        )
+    )
+    assert page.headings == [f"h1 {HOSTILE}", "h2 Table", "h2 What was asked"]
 
 
-def test_pictures_become_small_enough_and_missing_ones_are_left_out(tmp_path, monkeypatch):
+def test_pictures_become_small_enough(tmp_path, monkeypatch):
     noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.png")
-    (picture,) = pages.embed(tmp_path, {"noise.png": "noise", "no.png": "none"})
+    (picture,) = pages.embed(tmp_path, {"noise.png": "noise"}).values()
     assert (picture.width, picture.height) == (60, 40)
     monkeypatch.setattr(pages, "MAX_BYTES", 1_000)
-    (picture,) = pages.embed(tmp_path, {"noise.png": "noise"})
+    (picture,) = pages.embed(tmp_path, {"noise.png": "noise"}).values()
     assert picture.size <= 1_000 and picture.width < 40
     assert picture.width / picture.height == pytest.approx(1.5, abs=0.2)
 
