@@ -21,10 +21,19 @@ from .formatting import JoinedText, Table, aligned, bullets, joined
 from .motion_data import ShownClip
 
 ASKED = "What was asked"
+START, END = "<!-- posterior -->", "<!-- /posterior -->"  # no text of a user can hold them
 
 
 class Text(NamedTuple):
     """A paragraph; what is `code` or **strong** in Markdown is so."""
+
+    text: str
+    brief: bool = False
+    """Whether a terminal shows it."""
+
+
+class Heading(NamedTuple):
+    """A heading within a section."""
 
     text: str
     brief: bool = False
@@ -51,7 +60,6 @@ class Grid(NamedTuple):
     rows: Table
     label: str
     """For those who do not see it."""
-    title: str = ""
     brief: bool = True
     """Whether a terminal shows it."""
 
@@ -75,7 +83,7 @@ class Jump(NamedTuple):
     """Of the motion."""
 
 
-Block: TypeAlias = Text | Points | Terms | Grid | Plot | Jump
+Block: TypeAlias = Text | Heading | Points | Terms | Grid | Plot | Jump
 
 
 class Finding(NamedTuple):
@@ -91,6 +99,8 @@ class Section(NamedTuple):
 
     heading: str
     blocks: Sequence[Block]
+    on_page: bool = True
+    """Whether the page shows it, too; details may be left to Markdown."""
 
 
 @dataclass(frozen=True)
@@ -134,20 +144,9 @@ class Document:
         return [finding.text for finding in sorted(self.findings, key=lambda f: not f.bad)]
 
     @property
-    def filled(self) -> list[Section]:
-        """The sections that say something, with the blocks that do."""
-        sections = [Section(head, list(filter(_says_something, of))) for head, of in self.sections]
-        return [section for section in sections if section.blocks]
-
-    @property
-    def blocks(self) -> Iterator[Block]:
-        """The blocks of all sections."""
-        return (block for section in self.filled for block in section.blocks)
-
-    @property
     def plots(self) -> list[Plot]:
         """The plots of all sections."""
-        return [block for block in self.blocks if isinstance(block, Plot)]
+        return _plots(self.sections)
 
     @property
     def beside(self) -> dict[str, str]:
@@ -166,14 +165,66 @@ class Document:
             write_json(folder / path, content)
         for plot in self.plots:
             style.save(folder / plot.name, plot.draw())
-        files.write_text(folder / self.file, markdown(self))
-        pictures = pages.embed(folder, {plot.name: plot.caption for plot in self.plots})
+        files.write_text(folder / self.file, _whole(self))
+        pictures = _pictures(folder, self.sections)
         spent = sum(picture.size for picture in pictures.values())
         clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
         pages.write(
-            folder / pages.PAGE, "document.html", clips,
-            document=self, title=self.title, pictures=pictures,
+            folder / pages.PAGE, "document.html", clips, document=self, title=self.title,
+            sections=_on_page(self.sections), pictures=pictures,
         )  # fmt: skip
+
+
+def add(folder: Path, file: str, title: str, sections: Sequence[Section]) -> None:
+    """Adds sections to a document that is written, in place of those added before.
+
+    Args:
+        folder: of the document; without a page in it, none is made.
+        file: name of its Markdown file, which is made if needed.
+        title: of a file that is made.
+        sections: the headings of those added before begin with the same one.
+    """
+    page, path = folder / pages.PAGE, folder / file
+    for plot in _plots(sections):
+        style.save(folder / plot.name, plot.draw())
+    if page.is_file():
+        text = page.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
+        before, start, rest = text.partition(START)
+        _, end, after = rest.partition(END)
+        if end:
+            pictures = _pictures(folder, sections)
+            shown = pages.fragment("added.html", sections=_on_page(sections), pictures=pictures)
+            files.write_text(page, f"{before}{start}\n{shown}\n{end}{after}")
+    text = f"# {title}\n"
+    if path.is_file():
+        text = path.read_text(encoding="utf-8", errors="replace")
+    before = text.partition(f"\n## {sections[0].heading}\n")[0].rstrip()
+    files.write_text(path, "\n\n".join([before, *markdown(sections)]) + "\n")
+
+
+def _filled(sections: Sequence[Section]) -> list[Section]:
+    """The sections that say something, with the blocks that do."""
+    filled = [of._replace(blocks=list(filter(_says_something, of.blocks))) for of in sections]
+    return [section for section in filled if section.blocks]
+
+
+def _on_page(sections: Sequence[Section]) -> list[Section]:
+    return [section for section in _filled(sections) if section.on_page]
+
+
+def blocks_of(sections: Sequence[Section]) -> Iterator[Block]:
+    """The blocks of all sections that say something."""
+    return (block for section in _filled(sections) for block in section.blocks)
+
+
+def _plots(sections: Sequence[Section]) -> list[Plot]:
+    return [block for block in blocks_of(sections) if isinstance(block, Plot)]
+
+
+def _pictures(folder: Path, sections: Sequence[Section]) -> dict[str, pages.Picture]:
+    """Of the plots that the page shows, by file name."""
+    plots = _plots(_on_page(sections))
+    return pages.embed(folder, {plot.name: plot.caption for plot in plots})
 
 
 def _says_something(block: Block) -> bool:
@@ -190,46 +241,63 @@ def _says_something(block: Block) -> bool:
 
 def text(document: Document) -> JoinedText:
     """The document in brief, for a terminal: verdict, findings, tables."""
-    parts = [f"{document.verdict}.", bullets(document.sentences)]
-    for block in document.blocks:
+    parts = [f"{document.verdict}.", bullets(document.sentences), brief(document.sections)]
+    return joined(parts, apart=True)
+
+
+def brief(sections: Sequence[Section]) -> JoinedText:
+    """What a terminal shows of sections."""
+    parts: list[str] = []
+    for block in blocks_of(sections):
         match block:
             case Text(text=words, brief=True):
                 parts.append(words)
+            case Heading(text=words, brief=True):
+                parts.append(f"{words}:")
             case Points(lines=lines, brief=True):
                 parts.append(bullets(lines))
-            case Grid(rows=rows, title=title, brief=True):
-                parts += [f"{title}:", aligned(rows)] if title else [aligned(rows)]
+            case Grid(rows=rows, brief=True):
+                parts.append(aligned(rows))
             case _:
                 pass
     return joined(parts, apart=True)
 
 
-def markdown(document: Document) -> str:
+def _whole(document: Document) -> str:
     """The whole document in Markdown, but for the view."""
-    parts = [f"# {document.title}", f"{document.kind}: **{document.verdict}**."]
-    sections = [*document.filled, Section(ASKED, [Terms(document.asked)])]
-    parts.append(bullets(document.sentences))
-    for section in sections:
-        parts.append(f"## {section.heading}")
-        parts += [_markdown(block) for block in section.blocks if not isinstance(block, Jump)]
+    sections = [*document.sections, Section(ASKED, [Terms(document.asked)])]
     others = (f"[{name}]({name}) has {words}" for name, words in document.beside.items())
-    parts.append(f"More in this folder: {', '.join(islice(others, 1, None))}.")
+    parts = [
+        f"# {document.title}",
+        f"{document.kind}: **{document.verdict}**.",
+        bullets(document.sentences),
+        *markdown(sections),
+        f"More in this folder: {', '.join(islice(others, 1, None))}.",
+    ]
     return "\n\n".join(parts) + "\n"
 
 
-def _markdown(block: Text | Points | Terms | Grid | Plot) -> str:
-    match block:
-        case Text():
-            return block.text
-        case Points():
-            return bullets(block.lines)
-        case Terms():
-            return bullets([f"**{name}**: {words}" for name, words in block.rows])
-        case Grid():
-            table = formatting.markdown([[_red(cell) for cell in row] for row in block.rows])
-            return f"### {block.title}\n\n{table}" if block.title else table
-        case Plot():
-            return f"![{block.caption}]({block.name})"
+def markdown(sections: Sequence[Section]) -> Iterator[str]:
+    """The paragraphs of sections in Markdown."""
+    for section in _filled(sections):
+        yield f"## {section.heading}"
+        for block in section.blocks:
+            match block:
+                case Text():
+                    yield block.text
+                case Heading():
+                    yield f"### {block.text}"
+                case Points():
+                    yield bullets(block.lines)
+                case Terms():
+                    yield bullets([f"**{name}**: {words}" for name, words in block.rows])
+                case Grid():
+                    rows = [[_red(cell) for cell in row] for row in block.rows]
+                    yield formatting.markdown(rows)
+                case Plot():
+                    yield f"![{block.caption}]({block.name})"
+                case Jump():
+                    pass
 
 
 def _red(cell: str) -> str:

@@ -38,9 +38,11 @@ from fitting.inference.sample.blocks import SamplerSettings
 from fitting.motion.accuracy import Accuracy, Errors, clip_errors, summarise
 from fitting.report import pages
 from fitting.report.document import (
+    Block,
     Document,
     Finding,
     Grid,
+    Heading,
     Plot,
     Points,
     Section,
@@ -577,9 +579,9 @@ def _figures(experiment: Experiment, rows: Sequence[Row]) -> Section:
         "Each column is a fit. In brackets: how much a figure rises without the rule. Measured at "
         "the rate of the clips."
     )
-    grids = [
-        Grid(transposed(group(rows, part)), title, title) for part, title in titles(rows).items()
-    ]
+    grids: list[Block] = []
+    for part, title in titles(rows).items():
+        grids += [Heading(title, brief=True), Grid(transposed(group(rows, part)), title)]
     title = f"{experiment.name}: without each of its rules"
     plot = Plot(FIGURE, title, lambda: overview(rows, title))
     return Section(

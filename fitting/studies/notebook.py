@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.inference.sample.posterior import Posterior
-from fitting.report.document import Document, Grid, Plot
+from fitting.report.document import Document, Grid, Plot, blocks_of
 from fitting.report.formatting import Table, interval, number
 from fitting.runtime import display
 from jaxik.maths import parameter_tree
@@ -141,7 +141,7 @@ def comparison_html(comparison: Comparison) -> str:
 def document_html(document: Document) -> str:
     """The document in brief, with its plots."""
     shown: list[Markup] = []
-    for block in document.blocks:
+    for block in blocks_of(document.sections):
         if isinstance(block, Grid) and block.brief:
             shown.append(table(block.rows))
         elif isinstance(block, Plot):

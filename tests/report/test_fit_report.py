@@ -8,6 +8,7 @@ import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from xml.etree import ElementTree
 
@@ -30,6 +31,7 @@ from fitting.motion import goodness, playback
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.space import ParameterPrior, Priors, Space, make_space
+from fitting.report import document
 from fitting.report.formatting import markdown
 from fitting.runtime import display
 from fitting.studies.fit import fit_report, goodness_report, run_folder
@@ -346,7 +348,7 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitt
     assert "12 walkers, 240 steps, the first 40 left out" in text
     assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3." in text
     assert "Converged: the chain is long enough." in text
-    assert "The 95 % intervals contain the true values of 1 of 2 parameters." in text
+    assert "The 95 % intervals contain the true values of 1 of 2 parameters; among" in text
     assert "truth" not in posterior_report.posterior_text(sampled_fit(fitted, posterior, None))
 
 
@@ -424,9 +426,11 @@ def toy_posterior(names: tuple[str, ...] = NAMES, **other: Any) -> Posterior:
 
 def around_fit(posterior: Posterior, kind: str = "smooth") -> SampledFit:
     """As far as texts need it: a posterior around a fit with these rows."""
-    row = {"kind": kind, "value": 0.6, "interval": [0.5, 0.7]}
+    row = {"kind": kind, "value": 0.6, "interval": [0.5, 0.7], "unit": "1", "determined": True}
     rows: Any = [{"name": name} | row for name in posterior.names]
-    return SampledFit(cast(Any, None), space_of(posterior.names), rows, posterior)
+    return SampledFit(
+        cast(Any, SimpleNamespace(name="toy")), space_of(posterior.names), rows, posterior
+    )
 
 
 def text_of(**other: Any) -> str:
@@ -470,10 +474,8 @@ def test_islands_are_shown_with_weights_exchanges_and_medians():
     found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
     assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(islands=found)
     space = space_of(NAMES)
-    section = posterior_report.island_section(
-        toy_posterior(islands=found), space, dict.fromkeys(NAMES, "1")
-    )
-    text = "\n".join(section)
+    sampled = around_fit(toy_posterior(islands=found))
+    text = "\n".join(document.markdown(posterior_report.sections(sampled, None)))
     assert "| 1 | 81.0 % ± 1.2 % | 250 | 4 | -12.5 |" in text
     first, second = (np.asarray(space.values(jnp.full(2, u))) for u in (0.0, 1.5))
     assert f"| foot.share | 1 | {first[0]:.4g} | {second[0]:.4g} |" in text

@@ -21,13 +21,13 @@ from fitting.motion.measures import Cause, Extreme, Measures, Placement
 from fitting.motion.playback import RESIDUAL_KINDS
 from fitting.motion.worst_window import find_worst_window
 from fitting.problem.scene import legs_ws
-from fitting.report import formatting, motion_data, pages
+from fitting.report import document, formatting, motion_data, pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.style import save
 from fitting.studies import animations, comparison, comparison_report
 from fitting.studies.fit import fit_motions, fit_page, fit_plots, identifiability_report, sentences
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import posterior_report, run_comparison
+from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
 from support import comparisons, runs
 from support.comparisons import DEEP
@@ -310,16 +310,18 @@ def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
     page = (run / pages.PAGE).read_text()
     (tmp_path / pages.PAGE).write_text(page)
     for count in (1, 2):
-        lines = [f"chain {count} <b>"]
-        first = ["`jaxik fit` <i>: **run** it"]
-        posterior_report.insert(tmp_path, first, lines, [["parameter"], ["x"]])
+        lines = Points([f"chain {count} <b>"])
+        warning = Text("`jaxik fit` <i>: **run** it")
+        section = Section("Posterior", [warning, lines, Grid([["parameter"], ["x"]], "x")])
+        document.add(tmp_path, "summary.md", "walk", [section])
     sampled = Page(tmp_path / pages.PAGE)
     assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
     assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
     assert sampled.headings.count("h2 Posterior") == 1
     assert sampled.data == Page(run / pages.PAGE).data
     (tmp_path / pages.PAGE).write_text("of another kind")
-    posterior_report.insert(tmp_path, [], [], [["parameter"]])
+    document.add(tmp_path, "summary.md", "walk", [Section("Posterior", [Text("none")])])
+    assert (tmp_path / "summary.md").read_text() == "# walk\n\n## Posterior\n\nnone\n"
     assert (tmp_path / pages.PAGE).read_text() == "of another kind"
 
 
@@ -498,13 +500,9 @@ def test_what_went_badly_comes_first_and_what_says_nothing_is_left_out(tmp_path)
     assert "<li>good <code>a</code> <strong>b</strong></li>" in page.html
     assert '<td class="miss">2!</td>' in page.html and page.elements.count("script") == 2
     assert page.elements.count("canvas") == 0 and page.data == {"clips": []}
-    assert (
-        (tmp_path / "summary.md")
-        .read_text()
-        .startswith(
-            f"# {HOSTILE}\n\na test: **bad**.\n\n- bad <i>\n- good `a` **b**\n- good too\n\n## Table"
-        )
-    )
+    text = (tmp_path / "summary.md").read_text()
+    findings = "- bad <i>\n- good `a` **b**\n- good too"
+    assert text.startswith(f"# {HOSTILE}\n\na test: **bad**.\n\n{findings}\n\n## Table")
     assert page.headings == [f"h1 {HOSTILE}", "h2 Table", "h2 What was asked"]
 
 

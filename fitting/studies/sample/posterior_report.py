@@ -14,34 +14,29 @@ from fitting.inference.sample.diagnostics import ParameterSummary
 from fitting.inference.sample.modes import MIN_EXCHANGES, Island
 from fitting.inference.sample.posterior import Posterior
 from fitting.problem.space import Space
-from fitting.report import pages
-from fitting.report.formatting import (
-    RESIDUALS,
-    Table,
-    aligned,
-    bullets,
-    interval,
-    joined,
-    markdown,
-    number,
-    percent,
+from fitting.report.document import (
+    Block,
+    Grid,
+    Heading,
+    Plot,
+    Points,
+    Section,
+    Text,
+    add,
+    brief,
 )
+from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 from fitting.report.style import AFTER, CAPTURED, legend, styled
-from fitting.runtime import activity, files
+from fitting.runtime import activity
 from fitting.studies.fit import goodness_report
-from fitting.studies.fit.fit_report import gallery, save_plot
 from fitting.studies.fit.fit_tables import Truth
 from fitting.studies.fit.run_folder import LOWER_POINT, SUMMARY
 
 from . import posterior_plots
 from .predictive import SURPRISING, Band, Disagreement, PredictiveCheck, Statistic
-from .prior_report import posterior_prior_section
+from .prior_report import posterior_prior_blocks
 from .replay import Replay
 from .sample import SampledFit
-
-HEADING = "## Posterior"  # what follows it in summary.md is replaced
-
-START, END = "<!-- posterior -->", "<!-- /posterior -->"  # no text of a user can hold them
 
 MAX_CLIPS = 4  # that are drawn
 
@@ -51,20 +46,7 @@ CORRELATED = 0.3  # between neighbouring blocks, from which the standard error i
 
 def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
     """The result of a sampling, for the terminal; `run` is the folder where it is written."""
-    posterior, known_values = sampled.posterior, sampled.known_values
-    table = aligned(posterior_table(posterior, known_values, {}))
-    parts = [*_health(posterior), *contradiction_sentences(sampled, run)]
-    if sampled.replay is not None:
-        parts.append(predictive_sentence(sampled.replay.checks))
-    if sampled.left_out is not None:
-        parts.append(left_out_sentence(sampled.left_out))
-    parts += ["", table]
-    if posterior.sigmas:
-        parts += ["", aligned(goodness_report.sigma_table(posterior.sigmas))]
-    if known_values:
-        count = covered(posterior, known_values, posterior.names)
-        parts += ["", f"The 95 % intervals contain the true values of {count} parameters."]
-    return joined(parts)
+    return brief(sections(sampled, run))
 
 
 def write_posterior(run: Path, sampled: SampledFit) -> None:
@@ -74,54 +56,66 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
         run: the folder of the run.
         sampled: the posterior and the fit.
     """
-    experiment, posterior = sampled.experiment, sampled.posterior
-    known_values = sampled.known_values
+    with activity.announced("Drawing the posterior"):
+        add(run, SUMMARY, sampled.experiment.name, sections(sampled, run))
+
+
+def sections(sampled: SampledFit, run: Path | None) -> list[Section]:
+    """What a sampling says; `run` is the folder where it is written, if there is one."""
+    experiment, posterior, truth = sampled.experiment, sampled.posterior, sampled.known_values
     rows = {row["name"]: row for row in sampled.parameters}
     units = {name: row["unit"] for name, row in rows.items()}
     labels = [f"{name}, {units[name]}" if units[name] != "1" else name for name in posterior.names]
     values = {name: row["value"] for name, row in rows.items()}
-    with activity.announced("Drawing the posterior"):
-        title = f"{experiment.name}: posterior of the parameters"
-        figure = posterior_plots.corner(
-            posterior, labels, values, known_values, title, space=sampled.space
-        )
-        plots = save_plot(run, "corner.png", title, figure)
-        title = f"{experiment.name}: walkers"
-        figure = posterior_plots.chain(posterior, labels, known_values, title)
-        plots |= save_plot(run, "chain.png", title, figure)
-
-    contradictions = contradiction_sentences(sampled, run)
-    table = posterior_table(posterior, known_values, units)
-    insert(run, contradictions, _health(posterior), table)
-    parts = [HEADING, *(f"**{line}**" for line in contradictions)]
-    parts += [bullets(_health(posterior)), markdown(table)]
+    replay, left_out = sampled.replay, sampled.left_out
+    corner, walkers = (
+        f"{experiment.name}: posterior of the parameters",
+        f"{experiment.name}: walkers",
+    )
+    blocks: list[Block] = [
+        *(Text(f"**{line}**", brief=True) for line in contradiction_sentences(sampled, run)),
+        Points(_health(posterior), brief=True),
+        Grid(posterior_table(posterior, truth, units), "Posterior of the parameters"),
+    ]
     if posterior.sigmas:
-        parts.append("Sigmas of the noise, which were sampled along:")
-        parts.append(markdown(goodness_report.sigma_table(posterior.sigmas)))
-    if known_values:
+        blocks += [
+            Text("Sigmas of the noise, which were sampled along:"),
+            Grid(goodness_report.sigma_table(posterior.sigmas), "Sampled sigmas"),
+        ]
+    if truth:
         determined = [name for name, row in rows.items() if row["determined"]]
-        all_count = covered(posterior, known_values, posterior.names)
-        determined_count = covered(posterior, known_values, determined)
-        parts.append(
-            f"The 95 % intervals contain the true values of {all_count} parameters; among those "
-            f"that the fit calls determined, of {determined_count}."
+        blocks.append(
+            Text(
+                "The 95 % intervals contain the true values of "
+                f"{covered(posterior, truth, posterior.names)} parameters; among those that the "
+                f"fit calls determined, of {covered(posterior, truth, determined)}.",
+                brief=True,
+            )
         )
-    parts += island_section(posterior, sampled.space, units)
-    parts += posterior_prior_section(sampled, units)
-    if sampled.replay is not None:
-        parts += predictive_section(sampled.replay)
+    blocks += island_blocks(posterior, sampled.space, units)
+    blocks += posterior_prior_blocks(sampled, units)
+    plots = [
+        Plot(
+            "corner.png",
+            corner,
+            lambda: posterior_plots.corner(
+                posterior, labels, values, truth, corner, space=sampled.space
+            ),
+        ),
+        Plot(
+            "chain.png", walkers, lambda: posterior_plots.chain(posterior, labels, truth, walkers)
+        ),
+    ]
+    if replay is not None:
         title = f"{experiment.name}: the capture inside what the posterior would make"
-        figure = bands(sampled.replay.bands, title)
-        plots |= save_plot(run, "predictive.png", title, figure)
-    if sampled.left_out is not None and sampled.replay is not None:
-        parts += left_out_section(sampled.left_out, sampled.replay.blocks)
-    parts.append(gallery(plots))
-    summary = run / SUMMARY
-    text = f"# {experiment.name}\n"
-    if summary.is_file():
-        text = summary.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
-    before = text.partition(f"\n{HEADING}\n")[0].rstrip()
-    files.write_text(summary, before + "\n\n" + "\n\n".join(parts) + "\n")
+        blocks += predictive_blocks(replay)
+        plots.append(Plot("predictive.png", title, lambda: bands(replay.bands, title)))
+        if left_out is not None:
+            blocks += left_out_blocks(left_out, replay.blocks)
+    return [
+        Section("Posterior", blocks),
+        Section("Pictures of the posterior", plots, on_page=False),
+    ]
 
 
 def _health(posterior: Posterior) -> list[str]:
@@ -174,26 +168,6 @@ def covered(posterior: Posterior, truth: Mapping[str, float], names: Sequence[st
 def covers(row: ParameterSummary, true: float) -> bool:
     """Whether the 95 % interval of a posterior's row contains this value."""
     return row["low95"] <= true <= row["high95"]
-
-
-def insert(run: Path, warnings: Sequence[str], lines: Sequence[str], table: Table) -> None:
-    """Shows a posterior on the page of a run, in place of an older one; not without a page.
-
-    Args:
-        run: the folder of the run.
-        warnings: where the chain contradicts the fit, a sentence each.
-        lines: how the sampling went, likewise.
-        table: the posterior of the parameters.
-    """
-    path = run / pages.PAGE
-    if not path.is_file():
-        return
-    page = path.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
-    before, start, rest = page.partition(START)
-    _, end, after = rest.partition(END)
-    if end:
-        section = pages.fragment("posterior.html", warnings=warnings, lines=lines, posterior=table)
-        files.write_text(path, f"{before}{start}\n{section}\n{end}{after}")
 
 
 @styled
@@ -289,26 +263,32 @@ def island_sentences(posterior: Posterior) -> list[str]:
     return sentences
 
 
-def island_section(posterior: Posterior, space: Space, units: Mapping[str, str]) -> list[str]:
-    """Paragraphs of Markdown; none where there is one island only."""
+def island_blocks(posterior: Posterior, space: Space, units: Mapping[str, str]) -> list[Block]:
+    """Islands and their medians; nothing where there is one island only."""
     islands = posterior.islands
     if not islands:
         return []
-    parts = [
-        "### Islands",
-        "Parts of the posterior that lie apart. Walkers come and go between them by jumps, so that "
-        "each weighs as many draws as it deserves; exchanges count how often one came or left.",
-        markdown(island_table(islands)),
-        "Medians on each island:",
-        markdown(median_table(islands, space, units)),
+    blocks: list[Block] = [
+        Heading("Islands"),
+        Text(
+            "Parts of the posterior that lie apart. Walkers come and go between them by jumps, so "
+            "that each weighs as many draws as it deserves; exchanges count how often one came or "
+            "left."
+        ),
+        Grid(island_table(islands), "Islands", brief=False),
+        Text("Medians on each island:"),
+        Grid(median_table(islands, space, units), "Medians on each island", brief=False),
     ]
     if not all(island.is_weighed for island in islands):
-        parts.append(
-            f"Where there were fewer than {MIN_EXCHANGES} exchanges, the weight is out of reach: "
-            "there are as many draws as walkers happened to start there, and intervals over all "
-            "islands are no better. Sample longer, or narrow a prior to the island that is meant."
+        blocks.append(
+            Text(
+                f"Where there were fewer than {MIN_EXCHANGES} exchanges, the weight is out of "
+                "reach: there are as many draws as walkers happened to start there, and intervals "
+                "over all islands are no better. Sample longer, or narrow a prior to the island "
+                "that is meant."
+            )
         )
-    return parts
+    return blocks
 
 
 def island_table(islands: tuple[Island, ...]) -> Table:
@@ -365,18 +345,20 @@ def left_out_sentence(found: LeaveOneOut) -> str:
     return text
 
 
-def left_out_section(found: LeaveOneOut, blocks: BlockLogLikelihood) -> list[str]:
-    """Paragraphs of Markdown."""
+def left_out_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> list[Block]:
+    """How well each block is predicted from the others."""
     correlation = "unknown" if math.isnan(found.neighbours) else f"{found.neighbours:.2f}"
     return [
-        "### Blocks of frames left out",
-        left_out_sentence(found),
-        f"By Pareto-smoothed importance sampling, without another fit. Blocks last {SECONDS:g} s, "
-        "two steps of a walk, because what one frame misses its neighbours give away; the "
-        f"correlation of neighbouring blocks is {correlation}. With "
-        "`jaxik compare --runs`, fits of several systems to the same clips are compared by this "
-        "figure. The blocks that are predicted worst:",
-        markdown(worst_blocks(found, blocks)),
+        Heading("Blocks of frames left out"),
+        Text(left_out_sentence(found), brief=True),
+        Text(
+            "By Pareto-smoothed importance sampling, without another fit. Blocks last "
+            f"{SECONDS:g} s, two steps of a walk, because what one frame misses its neighbours "
+            f"give away; the correlation of neighbouring blocks is {correlation}. With "
+            "`jaxik compare --runs`, fits of several systems to the same clips are compared by "
+            "this figure. The blocks that are predicted worst:"
+        ),
+        Grid(worst_blocks(found, blocks), "Blocks that are predicted worst", brief=False),
     ]
 
 
@@ -412,19 +394,21 @@ def predictive_sentence(checks: Sequence[PredictiveCheck]) -> str:
     return f"The captured motion is unlike the posterior's replicates: {'; '.join(unlike)}."
 
 
-def predictive_section(replay: Replay) -> list[str]:
-    """Paragraphs of Markdown."""
+def predictive_blocks(replay: Replay) -> list[Block]:
+    """Whether the capture is like what the posterior makes."""
     count = len(replay.checks[0].rms.replicated) if replay.checks else 0
     return [
-        "### The capture beside replicates",
-        predictive_sentence(replay.checks),
-        f"{count} draws of the posterior move the clip again, each with noise of its own from the "
-        "model in force. Residuals are those from the draw's own motion, in sigmas: of the capture "
-        "the median over the draws, of the replicates 95 %. p is how often a replicate's figure is "
-        f"the larger one; an exclamation mark stands where it is below {SURPRISING:g} or above "
-        f"{1 - SURPRISING:g}. About 5 % of the frames should be outside the band of the replicates "
-        "that the picture shows.",
-        markdown(check_table(replay.checks, replay.bands)),
+        Heading("The capture beside replicates"),
+        Text(predictive_sentence(replay.checks), brief=True),
+        Text(
+            f"{count} draws of the posterior move the clip again, each with noise of its own from "
+            "the model in force. Residuals are those from the draw's own motion, in sigmas: of the "
+            "capture the median over the draws, of the replicates 95 %. p is how often a "
+            "replicate's figure is the larger one; an exclamation mark stands where it is below "
+            f"{SURPRISING:g} or above {1 - SURPRISING:g}. About 5 % of the frames should be "
+            "outside the band of the replicates that the picture shows."
+        ),
+        Grid(check_table(replay.checks, replay.bands), "Capture and replicates", brief=False),
     ]
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from fitting.inference.sample.prior_sensitivity import MAX_K, Reweighted
+from fitting.report.document import Block, Grid, Heading, Text
 from fitting.report.formatting import Table, interval, markdown, number
 from fitting.studies.fit.fit import FittedParameter
 
@@ -43,8 +44,8 @@ def _centre(row: FittedParameter) -> str:
     return number(centre) + (f" (system: {number(row['before'])})" if other else "")
 
 
-def posterior_prior_section(sampled: SampledFit, units: Mapping[str, str]) -> list[str]:
-    """Paragraphs of Markdown: prior beside posterior, and how much the one decides the other."""
+def posterior_prior_blocks(sampled: SampledFit, units: Mapping[str, str]) -> list[Block]:
+    """Prior beside posterior, and how much the one decides the other."""
     sensitivity = sampled.prior_sensitivity.items()
     moved = [name for name, rows in sensitivity if any(row["sensitive"] for row in rows)]
     unknown = [
@@ -52,26 +53,28 @@ def posterior_prior_section(sampled: SampledFit, units: Mapping[str, str]) -> li
         for name, rows in sensitivity
         if name not in moved and any(row["sensitive"] is None for row in rows)
     ]
-    parts = [
-        "### Prior and posterior",
-        "The last columns are the median and the 95 % interval if the parameter's own prior had "
-        "half or twice the spread in `u`, by weighting the draws. `k` is the Pareto shape of the "
-        f"weights; above {MAX_K:g} they are unreliable, and no figure is given.",
-        markdown(prior_and_posterior_table(sampled, units)),
-    ]
+    table = prior_and_posterior_table(sampled, units)
+    sentences = []
     if moved:
-        parts.append(
+        sentences.append(
             f"Sensitive to their prior, for an end of the interval moves by more than a quarter of "
             f"its width: {_names(moved)}."
         )
     if unknown:
-        parts.append(
+        sentences.append(
             f"The draws cannot tell how sensitive these are; sample with another `[prior]` to see: "
             f"{_names(unknown)}."
         )
-    if not moved and not unknown:
-        parts.append("No parameter is sensitive to its prior.")
-    return parts
+    return [
+        Heading("Prior and posterior"),
+        Text(
+            "The last columns are the median and the 95 % interval if the parameter's own prior "
+            "had half or twice the spread in `u`, by weighting the draws. `k` is the Pareto shape "
+            f"of the weights; above {MAX_K:g} they are unreliable, and no figure is given."
+        ),
+        Grid(table, "Prior and posterior", brief=False),
+        *map(Text, sentences or ["No parameter is sensitive to its prior."]),
+    ]
 
 
 def prior_and_posterior_table(sampled: SampledFit, units: Mapping[str, str]) -> Table:
