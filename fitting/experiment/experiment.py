@@ -1,6 +1,6 @@
 """An experiment: which parameters of which system are fitted to which clips."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -134,6 +134,11 @@ class ClipEntry:
         """How the terrain is read."""
         offset = self.terrain_offset or (0.0, 0.0, 0.0)
         return TerrainOptions(self.file_up, self.terrain_scale, offset, self.terrain_cell)
+
+    def with_paths(self, change: Callable[[Path], Path]) -> "ClipEntry":
+        """The entry with each of its paths changed."""
+        paths = {key: value for key, value in vars(self).items() if isinstance(value, Path)}
+        return replace(self, **{key: change(path) for key, path in paths.items()})
 
 
 @dataclass(frozen=True)

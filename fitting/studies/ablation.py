@@ -12,7 +12,7 @@ import hashlib
 import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypedDict
 
@@ -331,18 +331,12 @@ def _digest(entries: Sequence[ClipEntry]) -> str:
     return digest.hexdigest()
 
 
-def _placeless(entry: ClipEntry) -> ClipEntry:
-    """The entry with every path replaced by the same one."""
-    paths = [field.name for field in fields(entry) if isinstance(getattr(entry, field.name), Path)]
-    return replace(entry, **dict.fromkeys(paths, Path("/")))
-
-
 def _key(variant: Experiment, split_name: str, content: str) -> str:
     """A digest of everything that a row follows from, except the program itself.
 
     Of files it is their content that counts, and not where they are.
     """
-    clips = tuple(_placeless(entry) for entry in variant.clips)
+    clips = tuple(entry.with_paths(lambda _: Path("/")) for entry in variant.clips)
     plain = replace(variant, name="", without=(), sample=SamplerSettings(), clips=clips)
     text = "\n".join([experiment_to_toml(plain), split_name, content])
     return hashlib.sha256(text.encode()).hexdigest()

@@ -166,7 +166,9 @@ def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
 
 def test_the_run_of_another_experiment_is_not_taken_for_ones_own(out, experiment_file):
     experiment_file.write_text(f'loss = "cauchy"\n{experiment_file.read_text()}')
-    with pytest.raises(ValueError, match=r"seed_0: has the fit of another experiment, or of one"):
+    with pytest.raises(
+        ValueError, match=r"seed_0/row.json: has the fit of another experiment, or of one"
+    ):
         fit_many(experiment_file, out)
 
 

@@ -12,7 +12,7 @@ import io
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypeAlias, TypedDict
 
@@ -22,6 +22,7 @@ from fitting.experiment.experiment_files import experiment_to_toml
 from fitting.runtime import files
 from fitting.runtime.cluster import Effort
 from fitting.runtime.json_files import Finite, JsonFile
+from fitting.runtime.store import Store
 from fitting.studies.fit.fit import Fit, Interval
 from fitting.studies.population.population import clip_names
 
@@ -58,8 +59,8 @@ class FitTask:
 
     def identity(self) -> str:
         """64 characters that change with the experiment and with the content of its files."""
-        entries = tuple(_with_paths(entry, _name_of) for entry in self.experiment.clips)
-        text = experiment_to_toml(dataclasses.replace(self.experiment, clips=entries))
+        clips = [entry.with_paths(lambda path: Path(path.name)) for entry in self.experiment.clips]
+        text = experiment_to_toml(dataclasses.replace(self.experiment, clips=tuple(clips)))
         contents = [
             _digest(value)
             for entry in self.experiment.clips
@@ -122,7 +123,7 @@ def _alone(experiment: Experiment, entry: ClipEntry) -> Experiment:
 def _with_whole_paths(experiment: Experiment) -> Experiment:
     """The experiment for a process in another folder."""
     whole = None if experiment.whole is None else _with_whole_paths(experiment.whole)
-    clips = tuple(_with_paths(entry, Path.absolute) for entry in experiment.clips)
+    clips = tuple(entry.with_paths(Path.absolute) for entry in experiment.clips)
     return dataclasses.replace(experiment, clips=clips, whole=whole)
 
 
@@ -142,17 +143,6 @@ def _distinct(names: Sequence[str]) -> list[str]:
         f"{name}_{number}" if counts[name.casefold()] > 1 else name
         for number, name in enumerate(names, 1)
     ]
-
-
-def _with_paths(entry: ClipEntry, change: Callable[[Path], Path]) -> ClipEntry:
-    """An entry with each of its paths changed."""
-    paths = {key: change(value) for key, value in vars(entry).items() if isinstance(value, Path)}
-    return dataclasses.replace(entry, **paths)
-
-
-def _name_of(path: Path) -> Path:
-    """A file by its name only: it may be moved."""
-    return Path(path.name)
 
 
 def _digest(path: Path) -> str:
@@ -216,7 +206,9 @@ class Row(TypedDict):
     effort: NotRequired[Effort]
 
 
-ROW_FILE = JsonFile(Row, "written by `jaxik fit-many`", "delete it to fit anew")
+ROW_FILE = JsonFile(
+    Row, "written by `jaxik fit-many`", "delete it to fit anew, or name another folder"
+)
 
 
 def outcome_of(fitted: Fit) -> Outcome:
@@ -257,27 +249,27 @@ def failed_row(task: FitTask, error: str) -> Row:
     return _row(task, "failed", error)
 
 
-def kept_row(folder: Path, task: FitTask) -> Row | None:
+def recall_row(folder: Path, task: FitTask) -> Row | None:
     """The row of a fit that is whole already, in the folder of all fits; None if there is none.
 
     Raises:
         ValueError: the folder has the fit of an experiment that was changed since.
     """
-    path = folder / task.run / ROW
-    if not path.is_file():
-        return None
-    row = ROW_FILE.read(path)
-    if row["identity"] != task.identity():
-        raise ValueError(
-            f"{path.parent}: has the fit of another experiment, or of one that has changed since; "
-            "name another folder, or delete this one to fit it anew"
-        )
-    return row
+    name = f"{task.run / ROW}"
+    if not (folder / name).is_file():
+        return None  # without the identity, which takes reading all of the clips
+    return _store(folder).recall(name, {"identity": task.identity()})
 
 
-def write_row(folder: Path, row: Row) -> None:
+def keep_row(folder: Path, row: Row) -> None:
     """Says that a run is whole."""
-    ROW_FILE.write(folder / row["run"] / ROW, row)
+    _store(folder).keep(f"{row['run']}/{ROW}", row)
+
+
+def _store(folder: Path) -> Store[Row]:
+    return Store(
+        ROW_FILE, folder, "has the fit of another experiment, or of one that has changed since"
+    )
 
 
 def _row(task: FitTask, state: Literal["finished", "failed"], error: str) -> Row:
@@ -350,7 +342,7 @@ class ManyFits:
 
 
 class Tally:
-    """The rows of many fits: those that are kept from earlier calls, and new ones as they end."""
+    """The rows of many fits: those of earlier calls, and new ones as they end."""
 
     def __init__(self, folder: Path, tasks: Sequence[FitTask]) -> None:
         """Looks for finished fits.
@@ -359,11 +351,11 @@ class Tally:
             ValueError: the folder has the fit of an experiment that was changed since.
         """
         self.folder, self.tasks = folder, tasks
-        kept = [kept_row(folder, task) for task in tasks]
-        self.missing = [task for task, row in zip(tasks, kept, strict=True) if row is None]
+        rows = [recall_row(folder, task) for task in tasks]
+        self.missing = [task for task, row in zip(tasks, rows, strict=True) if row is None]
         """The fits that are to be made."""
         runs = [task.run.as_posix() for task in tasks]
-        self._rows = dict(zip(runs, kept, strict=True))
+        self._rows = dict(zip(runs, rows, strict=True))
         self._began = time.monotonic()
         self._made = self._failed = 0
 
@@ -376,7 +368,7 @@ class Tally:
     def look_again(self) -> None:
         """Takes the rows that were written and not yet told of, as an interrupt came between."""
         for task in self.missing:
-            if self._rows[task.run.as_posix()] is None and (row := kept_row(self.folder, task)):
+            if self._rows[task.run.as_posix()] is None and (row := recall_row(self.folder, task)):
                 self.add(row)
 
     def progress(self) -> ManyProgress:
