@@ -71,3 +71,8 @@ class Store(Generic[Result]):
             path = self.folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             self.kind.write(path, result)
+
+    def forget(self, name: str) -> None:
+        """Deletes a result, if it is there."""
+        if self.folder is not None:
+            (self.folder / name).unlink(missing_ok=True)

@@ -32,7 +32,7 @@ from support.gltf_files import walker
 from support.records import packed
 from support.sample_clips import AMC, ASF, BVH, stair_walk
 
-from . import kept_files, soundness
+from . import soundness, stored_files
 from .damage import (
     Random,
     archive_of,
@@ -310,21 +310,21 @@ FORMATS: dict[str, Format] = {
         },
     ),
     "state of a fit": Format(
-        "search.json", lambda: kept_files.solved()[2], kept_files.load_search, damage_json
+        "search.json", lambda: stored_files.solved()[2], stored_files.load_search, damage_json
     ),
     "search of a population": Format(
-        "searches/0123abcd.json", kept_files.found_text, kept_files.load_found, damage_json
+        "searches/0123abcd.json", stored_files.found_text, stored_files.load_found, damage_json
     ),
     "rows of an ablation": Format(
-        "contribution.json", kept_files.rows_text, kept_files.load_rows, damage_json
+        "contribution.json", stored_files.rows_text, stored_files.load_rows, damage_json
     ),
     **{
         f"{name} of a calibration": Format(
             f"{name}/0000.json",
-            lambda content=content: kept_files.text_of(content),
-            kept_files.load_replicate,
+            lambda content=content: stored_files.text_of(content),
+            stored_files.load_replicate,
             damage_json,
         )
-        for name, content in kept_files.REPLICATES.items()
+        for name, content in stored_files.REPLICATES.items()
     },
 }

@@ -31,7 +31,7 @@ from fitting.studies.fit import assess, run_folder
 from fitting.studies.fit.assess import search
 from fitting.studies.fit.fit import MAX_START_SD, THRESHOLD_SD, Fit
 from fitting.studies.sample.sample import walker_start
-from fuzz import kept_files
+from fuzz import stored_files
 from jaxik.maths import parameter_tree
 from support import quick, small_studies
 from support.commands import refusal
@@ -506,11 +506,11 @@ def test_a_chain_with_a_few_other_bytes_is_named_before_hdf5_reads_it(chain_file
 # What studies keep; `tests/runtime/test_files.py` damages any such file
 
 KEPT = {
-    "contribution.json": (kept_files.rows_text(), kept_files.load_rows, "ablate"),
-    "searches/0123.json": (kept_files.found_text(), kept_files.load_found, "population"),
+    "contribution.json": (stored_files.rows_text(), stored_files.load_rows, "ablate"),
+    "searches/0123.json": (stored_files.found_text(), stored_files.load_found, "population"),
     **{
-        f"{kind}/0000.json": (kept_files.text_of(whole), kept_files.load_replicate, "calibrate")
-        for kind, whole in kept_files.REPLICATES.items()
+        f"{kind}/0000.json": (stored_files.text_of(whole), stored_files.load_replicate, "calibrate")
+        for kind, whole in stored_files.REPLICATES.items()
     },
 }
 CHANGED = [

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem, digest_with
 from fitting.runtime import program_cache
 from fitting.runtime.json_files import Finite, JsonFile, between, length
+from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, in_one_line
 
 from .solution import Elite, Point, Progress, Search, SearchState, Stage, StepsUsedUp
@@ -97,47 +98,37 @@ class StoredSearches(TypedDict):
     profiles: dict[str, StoredProfiles]
 
 
-FILE = JsonFile(
-    StoredSearches,
-    "the state of a search",
-    "it is left alone and the search begins anew",
-    indent=None,
-)
+FILE = JsonFile(StoredSearches, "the state of a search", "the fit begins anew", indent=None)
 
 
-class KeptStages:
+class Checkpoints:
     """The stages of the searches and profiles of one fit, in memory and in a file."""
 
     def __init__(
-        self, path: Path, identity: str, warn: Callable[[str], object] = lambda reason: None
+        self,
+        folder: Path | None,
+        name: str,
+        identity: str,
+        warn: Callable[[str], object] = lambda reason: None,
     ):
         """Reads the stages that a killed process has left.
 
         Args:
-            path: the file; written when a stage is finished.
+            folder: of the file; None keeps them in memory.
+            name: of the file, which is written when a stage is finished.
             identity: of the fit. Stages of another one, or of another version of this program, are
                 not used.
             warn: called with one sentence where there are stages that cannot be used.
         """
         identity = f"{identity} {program_cache.sources()} {dict(program_cache.versions())}"
-        self.path, self._warn = path, warn
-        self._content: StoredSearches = {
-            "identity": identity,
-            "searches": {},
-            "profiles": {},
-        }
-        self._written = -np.inf
-        if not path.exists():
-            return
+        self._store = Store(FILE, folder, "the state of another fit, or of another version")
+        self._path, self._warn, self._written = Path(folder or "", name), warn, -np.inf
+        begun: StoredSearches = {"identity": identity, "searches": {}, "profiles": {}}
         try:
-            stored = FILE.read(path)
+            self._content = self._store.recall(name, {"identity": identity}) or begun
         except ValueError as error:
+            self._content = begun
             warn(f"{error}")
-            return
-        if stored["identity"] == identity:
-            self._content = stored
-        else:
-            warn(f"{path}: the state of another fit, or of another version; the fit begins anew")
 
     @property
     def count(self) -> int:
@@ -170,7 +161,7 @@ class KeptStages:
             try:
                 restore(profiles[key])
             except DAMAGES as error:
-                self._warn(f"{self.path}: damaged ({in_one_line(error)}); the profiles begin anew")
+                self._warn(f"{self._path}: damaged ({in_one_line(error)}); the profiles begin anew")
                 del profiles[key]
 
         def keep(stored: StoredProfiles) -> None:
@@ -188,7 +179,7 @@ class KeptStages:
             for stage in stages:
                 _check(stage, state)
         except DAMAGES as error:
-            self._warn(f"{self.path}: damaged ({in_one_line(error)}); the search begins anew")
+            self._warn(f"{self._path}: damaged ({in_one_line(error)}); the search begins anew")
             stages.clear()
         lines = [line for stage in stages for line in stage["history"]]
         elapsed = lines[-1]["seconds"] if lines else 0.0
@@ -198,12 +189,12 @@ class KeptStages:
     def flush(self) -> None:
         """Writes what is not on disk yet."""
         if self.count or self.profile_count:
-            FILE.write(self.path, self._content)
+            self._store.keep(self._path.name, self._content)
             self._written = time.monotonic()
 
     def remove(self) -> None:
         """Deletes the file: the fit is finished."""
-        self.path.unlink(missing_ok=True)
+        self._store.forget(self._path.name)
 
     def _write(self) -> None:
         if time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES:

@@ -32,7 +32,7 @@ from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from . import levenberg_marquardt
-from .checkpoints import KeptStages
+from .checkpoints import Checkpoints
 from .descent import descend, jacobian_at, point_of, polish
 from .evolution import evaluate, evolve, sweep_and_descend
 from .levenberg_marquardt import HardModel
@@ -61,7 +61,7 @@ def find_best_fit(
     first: Float[Array | np.ndarray, " free"] | None = None,
     seed: int = 0,
     progress: Callable[[Progress], None] | None = None,
-    kept: KeptStages | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """The free parameters of minimum cost.
 
@@ -75,7 +75,7 @@ def find_best_fit(
         first: the `u` from which the first start makes its first descent; None is the space's.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
-        kept: the stages of a search that was killed, which goes on after them; gets those of this.
+        checkpoints: stages of a search that was killed, which goes on after them; gets new ones.
 
     Raises:
         ValueError: for no start.
@@ -88,8 +88,8 @@ def find_best_fit(
     latest = SearchState.at(np.asarray(first), seed=seed)
     watch = _Watch(progress)
     search = Search(problem, settings, watch)
-    if kept is not None:
-        search = kept.attach(search, latest, starts)
+    if checkpoints is not None:
+        search = checkpoints.attach(search, latest, starts)
     before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
@@ -111,8 +111,8 @@ def find_best_fit(
         if not np.isfinite(latest.best.cost):
             raise
     finally:
-        if kept is not None:
-            kept.flush()
+        if checkpoints is not None:
+            checkpoints.flush()
     agreeing = count_agreeing(ends, settings)
     end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
     return _solution(search, end, before)
@@ -125,7 +125,7 @@ def refine(
     u: Float[np.ndarray, " free"],
     settings: SearchSettings = DEFAULTS,
     progress: Callable[[Progress], None] | None = None,
-    kept: KeptStages | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """A descent to the end from a point that is better than a solution, or for another noise.
 
@@ -137,13 +137,13 @@ def refine(
         u: where the descent begins.
         settings: how thoroughly to search.
         progress: called with every report.
-        kept: as for `find_best_fit`.
+        checkpoints: as for `find_best_fit`.
     """
     latest = SearchState.at(np.asarray(u))
     watch = _Watch(progress)
     search = Search(problem, settings, watch)
-    if kept is not None:
-        search = kept.attach(search, latest, 0)
+    if checkpoints is not None:
+        search = checkpoints.attach(search, latest, 0)
     used_up = interrupted = False
     try:
         with activity.announced("Descending from there"):
@@ -153,8 +153,8 @@ def refine(
     except KeyboardInterrupt:
         latest, interrupted = watch.latest or latest, True
     finally:
-        if kept is not None:
-            kept.flush()
+        if checkpoints is not None:
+            checkpoints.flush()
     if not np.isfinite(latest.best.cost):
         return dataclasses.replace(solution, interrupted=interrupted)
     end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.inference.optimise import evolution
-from fitting.inference.optimise.checkpoints import KeptStages, StoredPoints, StoredProfiles
+from fitting.inference.optimise.checkpoints import Checkpoints, StoredPoints, StoredProfiles
 from fitting.inference.optimise.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, from_fractions, to_fractions
@@ -232,18 +232,20 @@ def _points(stored: StoredPoints, size: int) -> Points:
     return Points(array(stored["u"]), array(stored["values"]), np.array(stored["cost"]))
 
 
-def find_curves(problem: Problem, solution: Solution, kept: KeptStages | None = None) -> Curves:
+def find_curves(
+    problem: Problem, solution: Solution, checkpoints: Checkpoints | None = None
+) -> Curves:
     """The profiles' points around a solution.
 
     Args:
         problem: what was fitted.
         solution: its best fit.
-        kept: the stages of profiles that were killed, which go on after them; gets those of these.
+        checkpoints: as for `find_best_fit`, of profiles.
     """
     profiling = Profiling.around(problem, solution)
     keep = None
-    if kept is not None:
-        keep = kept.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
+    if checkpoints is not None:
+        keep = checkpoints.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
     try:
         title = f"Following {problem.space.size} parameters over their ranges"
         with activity.announced(title, len(STAGES)) as following:
@@ -255,8 +257,8 @@ def find_curves(problem: Problem, solution: Solution, kept: KeptStages | None = 
                 if keep is not None:
                     keep(profiling.stored())
     finally:
-        if kept is not None:
-            kept.flush()
+        if checkpoints is not None:
+            checkpoints.flush()
     return profiling.curves
 
 

@@ -14,10 +14,10 @@ from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import ClipData, load_clips, load_known_values, problem_from_clips
 from fitting.experiment.record_files import left_out
 from fitting.inference.noise import NoiseModel, with_noise
-from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.solution import Progress, Solution
 from fitting.inference.sample.posterior import Posterior, SamplingProgress
-from fitting.problem.problem import Problem, digest_with
+from fitting.problem.problem import Problem
 from fitting.report import style
 from fitting.report.formatting import joined
 from fitting.runtime.precision import in_float64
@@ -29,7 +29,7 @@ from fitting.studies.sample.sample import SampledFit, minus_cost_at, sample_arou
 from fitting.studies.translation import TranslationRequest
 
 from . import capture_check, fit_report, record_price, run_folder
-from .assess import assess_solution, search, search_with_noise
+from .assess import assess_solution, search, search_identity, search_with_noise
 from .fit import Fit
 from .fit_motions import Rehearsal
 
@@ -88,7 +88,7 @@ def fit(
         heading = f"fitting {what} to {len(clips)} clip(s)"
         log("\n".join([heading, *lines, *capture_check.check(clips).lines]))
         loaded(experiment, problem, clips)
-        kept = kept_stages(run, experiment, problem, log)
+        checkpoints = open_checkpoints(run, experiment, problem, log)
         rehearsal = Rehearsal(problem) if run is not None and report else None
 
         def watch(reached: Progress) -> None:
@@ -97,17 +97,18 @@ def fit(
             if progress is not None:
                 progress(reached)
 
-        problem, solution = search_with_noise(problem, experiment, watch, kept)
+        problem, solution = search_with_noise(problem, experiment, watch, checkpoints)
         if solution.interrupted:
             log(INTERRUPTED)
         shown = Shown(clips, known_values)
         if run is not None and report:
             style.prepare_saving()
-        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, checkpoints)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None and report:
             fit_report.write_fit(run, fitted, sections, rehearsal=rehearsal)
-        remove(kept, fitted)
+        if not fitted.solution.interrupted:
+            checkpoints.remove()
         log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
@@ -207,19 +208,20 @@ def translate(
             f"{request.source.name} on {len(prepared.clips)} clip(s)"
         )
         start = translation.starting_point(problem)
-        kept = kept_stages(run, experiment, problem, log)
-        solution = search(problem, experiment, progress, start, kept)
+        checkpoints = open_checkpoints(run, experiment, problem, log)
+        solution = search(problem, experiment, progress, start, checkpoints)
         if solution.interrupted:
             log(INTERRUPTED)
         shown = Shown(prepared.clips, has_noise=False)
         if run is not None:
             translation.save_source(run, prepared)
             shown = shown._replace(known_values=load_known_values(experiment))
-        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, checkpoints)
         differences = translation.differences(fitted)
         if run is not None:
             translation.write(run, prepared, fitted, differences)
-        remove(kept, fitted)
+        if not fitted.solution.interrupted:
+            checkpoints.remove()
         log(f"\n{solution.message} {fitted.verdict.sentence}\n")
         log(translation.translation_text(prepared, differences))
         log_output(log, run, run_folder.SUMMARY)
@@ -299,7 +301,7 @@ def _assess_and_save(
     solution: Solution,
     shown: Shown,
     progress: Callable[[Progress], None] | None,
-    kept: KeptStages | None,
+    checkpoints: Checkpoints,
 ) -> Fit:
     """The fit; each of its solutions is on disk before the assessment, which may fail."""
 
@@ -307,30 +309,22 @@ def _assess_and_save(
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
 
-    fitted = assess_solution(experiment, problem, solution, progress, save, kept)
+    fitted = assess_solution(experiment, problem, solution, progress, save, checkpoints)
     fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted
 
 
-def kept_stages(
+def open_checkpoints(
     run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
-) -> KeptStages | None:
+) -> Checkpoints:
     """The finished stages of a fit that was killed in this folder, and room for those of this."""
-    if run is None:
-        return None
-    identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
-    kept = KeptStages(run / run_folder.SEARCH, identity, log)
-    if kept.count:
-        stages = f"{kept.count} stages of its search"
-        if kept.profile_count:
-            stages += f" and {kept.profile_count} of its profiles"
+    identity = search_identity(problem, experiment)
+    checkpoints = Checkpoints(run, run_folder.SEARCH, identity, log)
+    if checkpoints.count:
+        stages = f"{checkpoints.count} stages of its search"
+        if checkpoints.profile_count:
+            stages += f" and {checkpoints.profile_count} of its profiles"
         log(f"a fit that was interrupted here goes on after {stages}")
-    return kept
-
-
-def remove(kept: KeptStages | None, fitted: Fit) -> None:
-    """Removes the stages of a fit that is finished; an interrupted one goes on from them."""
-    if kept is not None and not fitted.solution.interrupted:
-        kept.remove()
+    return checkpoints

@@ -28,7 +28,7 @@ from fitting.inference.mixed_model import (
     model_around,
 )
 from fitting.inference.noise import NoiseModel, NoiseOptions, noise_of, with_noise
-from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.solution import Progress
 from fitting.motion.accuracy import position_error
 from fitting.problem.problem import Problem, digest_with
@@ -97,11 +97,13 @@ class Searches:
         if found is None:
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
-            kept = None if path is None else KeptStages(path.with_suffix(".part"), path.stem)
-            found = self._search(name, problem, noise, kept)
-            if path is not None and kept is not None:
+            checkpoints = (
+                None if path is None else Checkpoints(path.parent, f"{path.stem}.part", path.stem)
+            )
+            found = self._search(name, problem, noise, checkpoints)
+            if path is not None and checkpoints is not None:
                 FOUND_FILE.write(path, found)
-                kept.remove()
+                checkpoints.remove()
             self.on_found(found)
         if "noise" in found:
             problem = with_noise(problem, NoiseModel(**found["noise"]))
@@ -112,11 +114,11 @@ class Searches:
         name: str,
         problem: Problem[jaxik.FootIK],
         noise: NoiseOptions,
-        kept: KeptStages | None,
+        checkpoints: Checkpoints | None,
     ) -> Found:
         experiment = dataclasses.replace(self.experiment, noise=noise)
         progress = labelled(self.progress, name)
-        fitted, solution = search_with_noise(problem, experiment, progress, kept)
+        fitted, solution = search_with_noise(problem, experiment, progress, checkpoints)
         if solution.interrupted:
             raise KeyboardInterrupt
         found: Found = {

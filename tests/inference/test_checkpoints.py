@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fitting.inference.optimise import checkpoints, descent, evolution, search
-from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.solution import SearchSettings, Solution
 from fitting.inference.profiles import profiling
 from fitting.inference.profiles.profile import Curves
@@ -32,13 +32,13 @@ def problem() -> Problem:
 
 @pytest.fixture
 def path(tmp_path, monkeypatch) -> Path:
-    """Where stages are kept, each at once."""
+    """Where stages are written, each at once."""
     monkeypatch.setattr(checkpoints, "SECONDS_BETWEEN_WRITES", 0.0)
     return tmp_path / "search.json"
 
 
-def kept(path: Path, **options) -> KeptStages:
-    return KeptStages(path, "a fit", **options)
+def checkpoints_in(path: Path, **options) -> Checkpoints:
+    return Checkpoints(path.parent, path.name, "a fit", **options)
 
 
 def change_file(path: Path, change: Callable[[dict], object]) -> None:
@@ -57,8 +57,8 @@ def assert_warned(lines: list[str], message: str) -> None:
 
 
 def solve(path: Path | None, settings: SearchSettings = SETTINGS, seed: int = 0, **options):
-    stages = None if path is None else kept(path, **options)
-    return search.find_best_fit(problem(), settings, starts=2, seed=seed, kept=stages)
+    stages = None if path is None else checkpoints_in(path, **options)
+    return search.find_best_fit(problem(), settings, starts=2, seed=seed, checkpoints=stages)
 
 
 @functools.cache
@@ -159,7 +159,7 @@ def test_a_file_that_is_no_state_is_named(path):
     for content in (b'{"format": 1, "ident', b"\xff\x00"):
         path.write_bytes(content)
         lines = []
-        kept(path, warn=lines.append)
+        checkpoints_in(path, warn=lines.append)
         assert_warned(lines, "not the state of a search")
 
 
@@ -172,7 +172,7 @@ def solution() -> Solution:
 
 
 def find_curves(path: Path | None = None, **options) -> Curves:
-    return profiling.find_curves(problem(), solution(), path and kept(path, **options))
+    return profiling.find_curves(problem(), solution(), path and checkpoints_in(path, **options))
 
 
 def assert_same_curves(curves: Curves, others: Curves) -> None:
@@ -196,7 +196,7 @@ def test_profiles_go_on_after_each_of_their_stages_to_the_same_end(path, monkeyp
     found, called = find_curves(), []
     for number in range(1, 9):
         kill_at(number, monkeypatch, path)
-        assert kept(path).profile_count == number
+        assert checkpoints_in(path).profile_count == number
     stages = [lambda state: called.append(state.stages), *profiling.STAGES[1:]]
     monkeypatch.setattr(profiling, "STAGES", stages)
     assert_same_curves(find_curves(path), found)
@@ -207,7 +207,7 @@ def test_profiles_go_on_after_each_of_their_stages_to_the_same_end(path, monkeyp
 
 def test_the_profiles_of_another_solution_are_not_used(path, monkeypatch):
     kill_at(1, monkeypatch, path)
-    u, stored = solution().u, kept(path)
+    u, stored = solution().u, checkpoints_in(path)
     stored.recall_profiles(problem(), u + 1e-9, stop)
     stored.recall_profiles(curve_problem(problem().space.names, loss="huber"), u, stop)
     with pytest.raises(RuntimeError, match="a kill"):

@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from fitting.inference.optimise import search
-from fitting.inference.optimise.checkpoints import KeptStages
+from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.solution import Search, SearchSettings, SearchState, Solution
 from fitting.inference.profiles.profiling import Profiling
 from fitting.motion.accuracy import Accuracy
@@ -65,11 +65,11 @@ def solved() -> tuple[Problem, Solution, bytes]:
     problem = curve_problem()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "search.json"
-        kept = KeptStages(path, "a fit")
-        solution = search.find_best_fit(problem, SETTINGS, starts=1, kept=kept)
-        keep = kept.recall_profiles(problem, solution.u, _refuse)
+        checkpoints = Checkpoints(path.parent, path.name, "a fit")
+        solution = search.find_best_fit(problem, SETTINGS, starts=1, checkpoints=checkpoints)
+        keep = checkpoints.recall_profiles(problem, solution.u, _refuse)
         keep(Profiling.around(problem, solution).stored())
-        kept.flush()
+        checkpoints.flush()
         return problem, solution, path.read_bytes()
 
 
@@ -77,12 +77,12 @@ def solved() -> tuple[Problem, Solution, bytes]:
 def load_search(path: Path) -> None:
     """Goes on from a file; what a fit only warns of is an error."""
     problem, solution, _ = solved()
-    kept = KeptStages(path, "a fit", _refuse)
+    checkpoints = Checkpoints(path.parent, path.name, "a fit", _refuse)
     first = SearchState.at(np.asarray(problem.space.start), seed=0)
-    attached = kept.attach(Search(problem, SETTINGS), first, 1)
+    attached = checkpoints.attach(Search(problem, SETTINGS), first, 1)
     assert attached.recall is not None
     profiling = Profiling.around(problem, solution)
-    kept.recall_profiles(problem, solution.u, profiling.restore)
+    checkpoints.recall_profiles(problem, solution.u, profiling.restore)
     assert all(np.isfinite(curve.values).all() for curve in profiling.curves.curves)
 
 
