@@ -92,7 +92,7 @@ def found_text() -> bytes:
 
 def load_found(path: Path) -> None:
     """As `jaxik population` reads it."""
-    found = population._read_found(path, 2)
+    found = population.search_store(path.parent, 2).recall(path.name)
     assert found is not None and np.isfinite([*found["u"], found["cost"]]).all()
 
 

@@ -5,6 +5,7 @@ called again, it finds what it had, and the search that was running goes on afte
 """
 
 import dataclasses
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -31,14 +32,15 @@ from fitting.inference.noise import NoiseModel, NoiseOptions, noise_of, with_noi
 from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.solution import Progress
 from fitting.motion.accuracy import position_error
-from fitting.problem.problem import Problem, digest_with
+from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
 from fitting.runtime import activity
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
-from fitting.runtime.validation import Content, error_context
+from fitting.runtime.store import Store
+from fitting.runtime.validation import Content
 from fitting.studies.ablation import labelled
-from fitting.studies.fit.assess import search_with_noise
+from fitting.studies.fit.assess import search_identity, search_with_noise
 from jaxik.maths import parameter_tree
 
 SEARCHES = "searches"
@@ -72,7 +74,7 @@ class Searches:
 
     experiment: Experiment
     folder: Path | None
-    """Where they are kept; None keeps none."""
+    """Where they are stored; None stores none."""
     progress: Callable[[Progress], None] | None = None
     on_found: Callable[[Found], object] = lambda found: None
     """Called with each new result."""
@@ -91,20 +93,15 @@ class Searches:
             KeyboardInterrupt: the search was interrupted; it goes on when it is called again.
             ValueError: a file in the folder is something else.
         """
-        noise = self.experiment.noise if with_its_noise else NoiseOptions(correlation="given")
-        path = self._path(problem, noise)
-        found = None if path is None else _read_found(path, problem.space.size)
-        if found is None:
-            if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            checkpoints = (
-                None if path is None else Checkpoints(path.parent, f"{path.stem}.part", path.stem)
-            )
-            found = self._search(name, problem, noise, checkpoints)
-            if path is not None and checkpoints is not None:
-                FOUND_FILE.write(path, found)
-                checkpoints.remove()
-            self.on_found(found)
+        experiment = self.experiment
+        if not with_its_noise:
+            experiment = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
+        key = search_identity(problem, experiment)[:16]
+        folder = None if self.folder is None else self.folder / SEARCHES
+        checkpoints = Checkpoints(folder, f"{key}.part", key)
+        search = functools.partial(self._search, name, problem, experiment, checkpoints)
+        found = search_store(folder, problem.space.size).remember(f"{key}.json", search)
+        checkpoints.remove()
         if "noise" in found:
             problem = with_noise(problem, NoiseModel(**found["noise"]))
         return problem, found
@@ -113,10 +110,9 @@ class Searches:
         self,
         name: str,
         problem: Problem[jaxik.FootIK],
-        noise: NoiseOptions,
-        checkpoints: Checkpoints | None,
+        experiment: Experiment,
+        checkpoints: Checkpoints,
     ) -> Found:
-        experiment = dataclasses.replace(self.experiment, noise=noise)
         progress = labelled(self.progress, name)
         fitted, solution = search_with_noise(problem, experiment, progress, checkpoints)
         if solution.interrupted:
@@ -129,31 +125,24 @@ class Searches:
             "message": solution.message,
             "seconds": solution.seconds,
         }
-        if noise.estimates_any:
+        if experiment.noise.estimates_any:
             found["noise"] = dataclasses.asdict(noise_of(fitted))
+        self.on_found(found)
         return found
 
-    def _path(self, problem: Problem[jaxik.FootIK], noise: NoiseOptions) -> Path | None:
-        if self.folder is None:
-            return None
-        key = digest_with(problem, self.experiment.fit, self.experiment.seed, noise)
-        return self.folder / SEARCHES / f"{key[:16]}.json"
 
+def search_store(folder: Path | None, size: int) -> Store[Found]:
+    """The results of searches for so many parameters."""
 
-def _read_found(path: Path, size: int) -> Found | None:
-    """The result that a file holds, of so many parameters; None if there is no file."""
-    if not path.exists():
-        return None
-    found = FOUND_FILE.read(path)
-    with error_context(f"{path}: not written by `jaxik population`"):
+    def check(found: Found) -> None:
         if len(found["u"]) != size:
             raise ValueError(
-                f"u has {len(found['u'])} numbers; wanted {size}, one of each parameter; "
-                f"{FOUND_FILE.advice}"
+                f"u has {len(found['u'])} numbers; wanted {size}, one of each parameter"
             )
         if "noise" in found:
             NoiseModel(**found["noise"])  # checks its numbers
-    return found
+
+    return Store(FOUND_FILE, folder, check=check)
 
 
 class Estimate(TypedDict):
