@@ -19,7 +19,6 @@ from fitting.problem.space import FreeParameter, scale_width, to_fractions
 from fitting.runtime.precision import in_float64
 
 from . import noise
-from .optimise.checkpoints import Checkpoints
 from .optimise.solution import Solution
 from .profiles.profile import Profile, usual_rise
 from .profiles.profiling import find_curves
@@ -193,9 +192,7 @@ def is_determined(profile: Profile, contraction: float) -> bool:
 
 
 @in_float64
-def assess_identifiability(
-    problem: Problem, solution: Solution, checkpoints: Checkpoints | None = None
-) -> Identifiability:
+def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
     """What the data of a problem determine around its solution.
 
     The contraction of a parameter is `1 - (posterior width / prior width)²`, of 95 % intervals, on
@@ -204,7 +201,6 @@ def assess_identifiability(
     Args:
         problem: what was fitted.
         solution: its best fit.
-        checkpoints: as for `find_best_fit`, of profiles.
 
     Raises:
         ValueError: if the Jacobian at the solution is not finite.
@@ -221,7 +217,7 @@ def assess_identifiability(
             f" parameters are determined: {solution.message}"
         )
     laplace = _Laplace.around(problem, solution)
-    curves = find_curves(problem, solution, checkpoints)
+    curves = find_curves(problem, solution)
     profiles = curves.profiles()
     names = [space.names[i] for i in laplace.smooth]
     fractions = jax.nn.sigmoid(jnp.asarray(solution.u))

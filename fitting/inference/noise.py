@@ -26,7 +26,6 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
-from .optimise.checkpoints import Checkpoints
 from .optimise.search import cost_before, refine
 from .optimise.solution import DEFAULTS, Progress, SearchSettings, Solution
 
@@ -548,7 +547,6 @@ def fit_with_noise(
     solution: Solution,
     settings: SearchSettings = DEFAULTS,
     progress: Callable[[Progress], None] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that is likeliest there, and the problem with this noise.
 
@@ -563,7 +561,6 @@ def fit_with_noise(
         solution: of the problem.
         settings: of the descents.
         progress: called as they go on.
-        checkpoints: the stages of searches that were killed.
     """
     if not options.moves_optimum:
         return problem, solution
@@ -575,6 +572,6 @@ def fit_with_noise(
         if noise.change_from(noise_of(problem)) < JOINT_TOLERANCE:
             break
         problem = with_noise(problem, noise)
-        solution = refine(problem, solution, solution.u, settings, progress, checkpoints)
+        solution = refine(problem, solution, solution.u, settings, progress)
         solution = dataclasses.replace(solution, cost_before=cost_before(problem))
     return problem, solution

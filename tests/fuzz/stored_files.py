@@ -66,7 +66,8 @@ def solved() -> tuple[Problem, Solution, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "search.json"
         checkpoints = Checkpoints(path.parent, path.name, "a fit")
-        solution = search.find_best_fit(problem, SETTINGS, starts=1, checkpoints=checkpoints)
+        with checkpoints:
+            solution = search.find_best_fit(problem, SETTINGS, starts=1)
         keep = checkpoints.recall_profiles(problem, solution.u, _refuse)
         keep(Profiling.around(problem, solution).stored())
         checkpoints.flush()

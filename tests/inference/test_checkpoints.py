@@ -37,8 +37,8 @@ def path(tmp_path, monkeypatch) -> Path:
     return tmp_path / "search.json"
 
 
-def checkpoints_in(path: Path, **options) -> Checkpoints:
-    return Checkpoints(path.parent, path.name, "a fit", **options)
+def checkpoints_in(path: Path | None, **options) -> Checkpoints:
+    return Checkpoints(path and path.parent, "search.json", "a fit", **options)
 
 
 def change_file(path: Path, change: Callable[[dict], object]) -> None:
@@ -57,8 +57,8 @@ def assert_warned(lines: list[str], message: str) -> None:
 
 
 def solve(path: Path | None, settings: SearchSettings = SETTINGS, seed: int = 0, **options):
-    stages = None if path is None else checkpoints_in(path, **options)
-    return search.find_best_fit(problem(), settings, starts=2, seed=seed, checkpoints=stages)
+    with checkpoints_in(path, **options):
+        return search.find_best_fit(problem(), settings, starts=2, seed=seed)
 
 
 @functools.cache
@@ -172,7 +172,8 @@ def solution() -> Solution:
 
 
 def find_curves(path: Path | None = None, **options) -> Curves:
-    return profiling.find_curves(problem(), solution(), path and checkpoints_in(path, **options))
+    with checkpoints_in(path, **options):
+        return profiling.find_curves(problem(), solution())
 
 
 def assert_same_curves(curves: Curves, others: Curves) -> None:

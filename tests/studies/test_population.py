@@ -97,10 +97,10 @@ def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
     estimated: list[int] = []
     search = population.search_with_noise
 
-    def watched(problem, experiment, progress, checkpoints):
+    def watched(problem, experiment, progress):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
         quiet = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
-        return search(problem, quiet, progress, checkpoints)
+        return search(problem, quiet, progress)
 
     monkeypatch.setattr(population, "search_with_noise", watched)
     rest, out = VARYING.replace(GIVEN, '[noise]\nsigmas = "estimated"\n'), tmp_path / "out"

@@ -13,6 +13,7 @@ belongs to one fit, which its identity names; stages of another are not used.
 import dataclasses
 import time
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -102,7 +103,11 @@ FILE = JsonFile(StoredSearches, "the state of a search", "the fit begins anew", 
 
 
 class Checkpoints:
-    """The stages of the searches and profiles of one fit, in memory and in a file."""
+    """The stages of the searches and profiles of one fit, in memory and in a file.
+
+    While it is entered as a context, the searches and profiles of this thread go on after its
+    stages, and add theirs.
+    """
 
     def __init__(
         self,
@@ -114,7 +119,7 @@ class Checkpoints:
         """Reads the stages that a killed process has left.
 
         Args:
-            folder: of the file; None keeps them in memory.
+            folder: of the file; None keeps none.
             name: of the file, which is written when a stage is finished.
             identity: of the fit. Stages of another one, or of another version of this program, are
                 not used.
@@ -129,6 +134,13 @@ class Checkpoints:
         except ValueError as error:
             self._content = begun
             warn(f"{error}")
+
+    def __enter__(self) -> "Checkpoints":
+        self._token = _current.set(self)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        _current.reset(self._token)
 
     @property
     def count(self) -> int:
@@ -156,6 +168,8 @@ class Checkpoints:
         Returns:
             What keeps the profiles, to be called after every stage.
         """
+        if self._store.folder is None:
+            return lambda stored: None
         profiles, key = self._content["profiles"], digest_with(problem, u.tolist())[:16]
         if key in profiles:
             try:
@@ -172,6 +186,8 @@ class Checkpoints:
 
     def attach(self, search: Search, state: SearchState, starts: int) -> Search:
         """The search with its stages recalled from here, and kept here."""
+        if self._store.folder is None:
+            return search
         first = (state.best.u.tolist(), state.random.bit_generator.state)
         key = digest_with(search.problem, search.settings, first, starts)[:16]
         stages = self._content["searches"].setdefault(key, [])
@@ -199,6 +215,14 @@ class Checkpoints:
     def _write(self) -> None:
         if time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES:
             self.flush()
+
+
+_current: ContextVar[Checkpoints | None] = ContextVar("current", default=None)
+
+
+def current() -> Checkpoints:
+    """The checkpoints that are entered; else some that keep nothing."""
+    return _current.get() or Checkpoints(None, "", "")
 
 
 @dataclasses.dataclass

@@ -31,8 +31,7 @@ from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
-from . import levenberg_marquardt
-from .checkpoints import Checkpoints
+from . import checkpoints, levenberg_marquardt
 from .descent import descend, jacobian_at, point_of, polish
 from .evolution import evaluate, evolve, sweep_and_descend
 from .levenberg_marquardt import HardModel
@@ -61,7 +60,6 @@ def find_best_fit(
     first: Float[Array | np.ndarray, " free"] | None = None,
     seed: int = 0,
     progress: Callable[[Progress], None] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """The free parameters of minimum cost.
 
@@ -75,7 +73,6 @@ def find_best_fit(
         first: the `u` from which the first start makes its first descent; None is the space's.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
-        checkpoints: stages of a search that was killed, which goes on after them; gets new ones.
 
     Raises:
         ValueError: for no start.
@@ -87,9 +84,8 @@ def find_best_fit(
     first = problem.space.start if first is None else first
     latest = SearchState.at(np.asarray(first), seed=seed)
     watch = _Watch(progress)
-    search = Search(problem, settings, watch)
-    if checkpoints is not None:
-        search = checkpoints.attach(search, latest, starts)
+    current = checkpoints.current()
+    search = current.attach(Search(problem, settings, watch), latest, starts)
     before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
@@ -111,8 +107,7 @@ def find_best_fit(
         if not np.isfinite(latest.best.cost):
             raise
     finally:
-        if checkpoints is not None:
-            checkpoints.flush()
+        current.flush()
     agreeing = count_agreeing(ends, settings)
     end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
     return _solution(search, end, before)
@@ -125,7 +120,6 @@ def refine(
     u: Float[np.ndarray, " free"],
     settings: SearchSettings = DEFAULTS,
     progress: Callable[[Progress], None] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """A descent to the end from a point that is better than a solution, or for another noise.
 
@@ -137,13 +131,11 @@ def refine(
         u: where the descent begins.
         settings: how thoroughly to search.
         progress: called with every report.
-        checkpoints: as for `find_best_fit`.
     """
     latest = SearchState.at(np.asarray(u))
     watch = _Watch(progress)
-    search = Search(problem, settings, watch)
-    if checkpoints is not None:
-        search = checkpoints.attach(search, latest, 0)
+    current = checkpoints.current()
+    search = current.attach(Search(problem, settings, watch), latest, 0)
     used_up = interrupted = False
     try:
         with activity.announced("Descending from there"):
@@ -153,8 +145,7 @@ def refine(
     except KeyboardInterrupt:
         latest, interrupted = watch.latest or latest, True
     finally:
-        if checkpoints is not None:
-            checkpoints.flush()
+        current.flush()
     if not np.isfinite(latest.best.cost):
         return dataclasses.replace(solution, interrupted=interrupted)
     end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)

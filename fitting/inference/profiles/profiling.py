@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fitting.inference.optimise import evolution
-from fitting.inference.optimise.checkpoints import Checkpoints, StoredPoints, StoredProfiles
+from fitting.inference.optimise import checkpoints, evolution
+from fitting.inference.optimise.checkpoints import StoredPoints, StoredProfiles
 from fitting.inference.optimise.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, from_fractions, to_fractions
@@ -232,20 +232,10 @@ def _points(stored: StoredPoints, size: int) -> Points:
     return Points(array(stored["u"]), array(stored["values"]), np.array(stored["cost"]))
 
 
-def find_curves(
-    problem: Problem, solution: Solution, checkpoints: Checkpoints | None = None
-) -> Curves:
-    """The profiles' points around a solution.
-
-    Args:
-        problem: what was fitted.
-        solution: its best fit.
-        checkpoints: as for `find_best_fit`, of profiles.
-    """
-    profiling = Profiling.around(problem, solution)
-    keep = None
-    if checkpoints is not None:
-        keep = checkpoints.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
+def find_curves(problem: Problem, solution: Solution) -> Curves:
+    """The profiles' points around a solution of a problem."""
+    profiling, current = Profiling.around(problem, solution), checkpoints.current()
+    keep = current.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
     try:
         title = f"Following {problem.space.size} parameters over their ranges"
         with activity.announced(title, len(STAGES)) as following:
@@ -254,11 +244,9 @@ def find_curves(
                 stage(profiling)
                 profiling.stages += 1
                 following.reach(profiling.stages)
-                if keep is not None:
-                    keep(profiling.stored())
+                keep(profiling.stored())
     finally:
-        if checkpoints is not None:
-            checkpoints.flush()
+        current.flush()
     return profiling.curves
 
 

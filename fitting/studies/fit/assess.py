@@ -10,7 +10,6 @@ import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import counted, fit_with_noise
-from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.inference.optimise.search import find_best_fit, refine
 from fitting.inference.optimise.solution import Progress, Solution
 from fitting.motion import playback
@@ -30,7 +29,6 @@ def search(
     experiment: Experiment,
     progress: Callable[[Progress], None] | None = None,
     first: Float[np.ndarray, " free"] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """The best fit, without any estimate of how certain it is.
 
@@ -39,7 +37,6 @@ def search(
         experiment: its settings of the search.
         progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
         first: the u from which the first descent begins; None is the experiment's.
-        checkpoints: the stages of a search that was killed, which goes on after them.
     """
     return find_best_fit(
         problem.with_weight(1.0),
@@ -48,7 +45,6 @@ def search(
         first=first,
         seed=experiment.seed,
         progress=progress,
-        checkpoints=checkpoints,
     )
 
 
@@ -56,7 +52,6 @@ def search_with_noise(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     progress: Callable[[Progress], None] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
@@ -66,11 +61,10 @@ def search_with_noise(
         problem: the problem of the experiment.
         experiment: its settings of noise and search.
         progress: as for `search`.
-        checkpoints: as for `search`.
     """
-    solution = search(problem, experiment, progress, checkpoints=checkpoints)
+    solution = search(problem, experiment, progress)
     settings, noise = experiment.fit.search, experiment.noise
-    problem, solution = fit_with_noise(problem, noise, solution, settings, progress, checkpoints)
+    problem, solution = fit_with_noise(problem, noise, solution, settings, progress)
     return weighted(problem, experiment, solution), solution
 
 
@@ -103,7 +97,6 @@ def assess_solution(
     solution: Solution,
     progress: Callable[[Progress], None] | None = None,
     on_solution: Callable[[Solution], object] = lambda solution: None,
-    checkpoints: Checkpoints | None = None,
 ) -> Fit:
     """The fit: a solution and how certain it is, or the lower one that its profiles led to.
 
@@ -113,7 +106,6 @@ def assess_solution(
         solution: of the problem.
         progress: called as a search goes on.
         on_solution: called with each solution before its assessment, which may fail.
-        checkpoints: the stages of searches and profiles that were killed.
 
     Raises:
         ValueError: if the Jacobian at a solution is not finite.
@@ -122,13 +114,13 @@ def assess_solution(
     while True:
         on_solution(solution)
         of_weight = solution.weighted(float(problem.weight))
-        identifiability = assess_identifiability(problem, of_weight, checkpoints)
+        identifiability = assess_identifiability(problem, of_weight)
         found_lower = identifiability.improvement > MIN_IMPROVEMENT
         fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
             return fit
         first = identifiability.best_u
-        lower = _search_lower(problem, experiment, solution, first, progress, checkpoints)
+        lower = _search_lower(problem, experiment, solution, first, progress)
         if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
             unmoved = dataclasses.replace(solution, interrupted=lower.interrupted)
             return dataclasses.replace(fit, solution=unmoved)
@@ -143,7 +135,6 @@ def _search_lower(
     before: Solution,
     lower_u: Float[np.ndarray, " free"],
     progress: Callable[[Progress], None] | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Solution:
     """The best fit from a point that is lower than a solution; steps and time add to its own.
 
@@ -155,10 +146,9 @@ def _search_lower(
         before: the solution that is left.
         lower_u: the lower point, in u.
         progress: called as the search goes on.
-        checkpoints: the stages of searches that were killed.
     """
     settings = experiment.fit.search
-    after = refine(problem.with_weight(1.0), before, lower_u, settings, progress, checkpoints)
+    after = refine(problem.with_weight(1.0), before, lower_u, settings, progress)
     if after.interrupted or before.cost - after.cost <= settings.agreement:
         return after
-    return search(problem, experiment, progress, after.u, checkpoints).following(after)
+    return search(problem, experiment, progress, after.u).following(after)

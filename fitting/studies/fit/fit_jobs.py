@@ -97,13 +97,14 @@ def fit(
             if progress is not None:
                 progress(reached)
 
-        problem, solution = search_with_noise(problem, experiment, watch, checkpoints)
-        if solution.interrupted:
-            log(INTERRUPTED)
-        shown = Shown(clips, known_values)
-        if run is not None and report:
-            style.prepare_saving()
-        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, checkpoints)
+        with checkpoints:
+            problem, solution = search_with_noise(problem, experiment, watch)
+            if solution.interrupted:
+                log(INTERRUPTED)
+            shown = Shown(clips, known_values)
+            if run is not None and report:
+                style.prepare_saving()
+            fitted = _assess_and_save(run, experiment, problem, solution, shown, progress)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None and report:
             fit_report.write_fit(run, fitted, sections, rehearsal=rehearsal)
@@ -209,14 +210,15 @@ def translate(
         )
         start = translation.starting_point(problem)
         checkpoints = open_checkpoints(run, experiment, problem, log)
-        solution = search(problem, experiment, progress, start, checkpoints)
-        if solution.interrupted:
-            log(INTERRUPTED)
-        shown = Shown(prepared.clips, has_noise=False)
-        if run is not None:
-            translation.save_source(run, prepared)
-            shown = shown._replace(known_values=load_known_values(experiment))
-        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, checkpoints)
+        with checkpoints:
+            solution = search(problem, experiment, progress, start)
+            if solution.interrupted:
+                log(INTERRUPTED)
+            shown = Shown(prepared.clips, has_noise=False)
+            if run is not None:
+                translation.save_source(run, prepared)
+                shown = shown._replace(known_values=load_known_values(experiment))
+            fitted = _assess_and_save(run, experiment, problem, solution, shown, progress)
         differences = translation.differences(fitted)
         if run is not None:
             translation.write(run, prepared, fitted, differences)
@@ -301,7 +303,6 @@ def _assess_and_save(
     solution: Solution,
     shown: Shown,
     progress: Callable[[Progress], None] | None,
-    checkpoints: Checkpoints,
 ) -> Fit:
     """The fit; each of its solutions is on disk before the assessment, which may fail."""
 
@@ -309,7 +310,7 @@ def _assess_and_save(
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
 
-    fitted = assess_solution(experiment, problem, solution, progress, save, checkpoints)
+    fitted = assess_solution(experiment, problem, solution, progress, save)
     fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
     if run is not None:
         run_folder.save_fit(run, fitted)

@@ -98,9 +98,9 @@ class Searches:
             experiment = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
         key = search_identity(problem, experiment)[:16]
         folder = None if self.folder is None else self.folder / SEARCHES
-        checkpoints = Checkpoints(folder, f"{key}.part", key)
-        search = functools.partial(self._search, name, problem, experiment, checkpoints)
-        found = search_store(folder, problem.space.size).remember(f"{key}.json", search)
+        search = functools.partial(self._search, name, problem, experiment)
+        with Checkpoints(folder, f"{key}.part", key) as checkpoints:
+            found = search_store(folder, problem.space.size).remember(f"{key}.json", search)
         checkpoints.remove()
         if "noise" in found:
             problem = with_noise(problem, NoiseModel(**found["noise"]))
@@ -111,10 +111,9 @@ class Searches:
         name: str,
         problem: Problem[jaxik.FootIK],
         experiment: Experiment,
-        checkpoints: Checkpoints,
     ) -> Found:
         progress = labelled(self.progress, name)
-        fitted, solution = search_with_noise(problem, experiment, progress, checkpoints)
+        fitted, solution = search_with_noise(problem, experiment, progress)
         if solution.interrupted:
             raise KeyboardInterrupt
         found: Found = {
