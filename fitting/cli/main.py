@@ -5,13 +5,13 @@ import atexit
 import gc
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
-from . import jax_start, start, terminal, without_jax
+from . import jax_start, start, terminal
 from .parser import make_parser
 from .terminal import watched
 
@@ -47,25 +47,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Runs the function of a command; those that run without JAX may import at any moment."""
-    function = _function(options.command)
-    if options.command in without_jax.COMMANDS:
-        return function(options)
+    """Runs a command; one that runs without JAX may import at any moment."""
+    if not options.needs_jax:
+        return options.call(options)
+    _import_jax()
     with start.interrupts_raised():
-        return function(options)
+        return options.call(options)
 
 
-def _function(command: str) -> Callable[[argparse.Namespace], int]:
-    """The function of a command; only imports JAX, which takes seconds, if that needs it."""
-    if command in without_jax.COMMANDS:
-        return without_jax.COMMANDS[command]
+def _import_jax() -> None:
+    """Imports JAX and what uses it, which takes seconds."""
     gc.set_threshold(*COLLECTIONS)
     atexit.register(gc.freeze)  # or Python, as it ends, looks at all of them several times more
     with activity.announced("Importing JAX"):
         jax_start.start()
-        from . import commands
-
-    return commands.COMMANDS[command]
+        from fitting import jobs  # noqa: F401  # while Ctrl-C still ends the process
 
 
 def _with_new_command(words: list[str]) -> list[str]:

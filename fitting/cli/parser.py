@@ -1,23 +1,13 @@
 """The words and options of the command `jaxik`. Imports no JAX, so that `--help` is fast."""
 
 import argparse
+import re
+from typing import Any, NoReturn
 
-from .help_texts import help_formatter
-from .parsers.animations import add_apply, add_compare, add_run, add_view
-from .parsers.files import add_export, add_inspect, add_record, add_terrain
-from .parsers.fits import (
-    add_ablate,
-    add_calibrate,
-    add_fit,
-    add_init,
-    add_population,
-    add_sample,
-    add_translate,
-)
-from .parsers.guides import add_completion, add_doctor, add_example, add_parameters, add_schema
-from .parsers.machine import add_bench, add_cache
-from .parsers.many import add_fit_many
-from .parsers.options import Parser
+from fitting.runtime.validation import in_one_line
+
+from . import animations, files, fits, guides, machine
+from .options import help_formatter
 
 EXAMPLES = """examples:
   jaxik init walk.bvh -o walk                                  a first experiment of your clip
@@ -55,6 +45,27 @@ then has written the best point so far, `sample` its chain, `ablate`, `calibrate
 """
 
 
+COMMANDS = (
+    fits.init, fits.fit, fits.ablate, fits.calibrate, fits.population, fits.fit_many, fits.sample,
+    animations.apply, animations.run, animations.view, animations.compare, fits.translate,
+    files.inspect, files.terrain, machine.bench, files.record, files.export, machine.cache,
+    guides.parameters, guides.schema, guides.example, machine.doctor, machine.completion,
+)  # fmt: skip
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports a mistake as the commands do: in one line, with status 2."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-(\.?\d|inf)")  # or -1e3 is an option
+
+    def error(self, message: str) -> NoReturn:
+        """Prints what is wrong with the words, without the usage, and exits."""
+        line = in_one_line(ValueError(message))
+        self.exit(2, f"{self.prog}: {line}; see `{self.prog} --help`\n")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     top = Parser(
@@ -64,11 +75,6 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=help_formatter(),
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (
-        add_init, add_fit, add_ablate, add_calibrate, add_population, add_fit_many, add_sample,
-        add_apply, add_run, add_view, add_compare, add_translate, add_inspect, add_terrain,
-        add_bench, add_record, add_export, add_cache, add_parameters, add_schema, add_example,
-        add_doctor, add_completion,
-    ):  # fmt: skip
-        add(commands)
+    for command in COMMANDS:
+        command.add_to(commands)
     return top

@@ -1,19 +1,20 @@
 """Reports of a search or a sampling, in a line, and Ctrl-C that is never lost meanwhile."""
 
+import math
 import signal
 import threading
 from collections.abc import Callable
 from types import FrameType
-from typing import Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
-import numpy as np
-
-from fitting.inference.optimise.solution import Progress
-from fitting.inference.sample.posterior import SamplingProgress
 from fitting.runtime import activity
-from fitting.studies.calibrate.calibration import CalibrationProgress
 
 from . import start
+
+if TYPE_CHECKING:
+    from fitting.inference.optimise.solution import Progress
+    from fitting.inference.sample.posterior import SamplingProgress
+    from fitting.studies.calibrate.calibration import CalibrationProgress
 
 Report = TypeVar("Report")
 Handler: TypeAlias = Callable[[int, FrameType | None], object] | int | None  # of a signal
@@ -55,7 +56,7 @@ class ProgressLine(Generic[Report]):
         activity.note(self.show(report))
 
 
-def fit_line(progress: Progress) -> str:
+def fit_line(progress: "Progress") -> str:
     """The progress of a search in one line."""
     return (
         f"start {progress.start + 1}  {progress.stage:<9} step {progress.step:<4} "
@@ -63,16 +64,16 @@ def fit_line(progress: Progress) -> str:
     )
 
 
-def sample_line(progress: SamplingProgress) -> str:
+def sample_line(progress: "SamplingProgress") -> str:
     """The progress of a sampling in one line."""
     slowest = progress.autocorrelation_time
-    ending = "" if np.isnan(slowest) else f"  slowest autocorrelation {slowest:.0f} steps"
+    ending = "" if math.isnan(slowest) else f"  slowest autocorrelation {slowest:.0f} steps"
     return (
         f"step {progress.step} of at most {progress.max_steps}  acceptance "
         f"{progress.acceptance:.2f}  log p {progress.log_probability:.1f}{ending}"
     )
 
 
-def calibration_line(progress: CalibrationProgress) -> str:
+def calibration_line(progress: "CalibrationProgress") -> str:
     """The progress of a calibration in one line."""
     return f"replicate {progress.replicate} of {progress.replicates}  {progress.stage}"

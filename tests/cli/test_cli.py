@@ -18,10 +18,8 @@ import jsonschema
 import numpy as np
 import pytest
 
-from fitting.cli import main, progress, start, without_jax
-from fitting.cli.commands import COMMANDS
+from fitting.cli import machine, main, progress, start
 from fitting.cli.parser import make_parser
-from fitting.cli.parsers.guides import SHELLS
 from fitting.clips import formats, load_clip, save_clip
 from fitting.clips.clip_frames import raised
 from fitting.experiment import systems
@@ -36,7 +34,7 @@ from fitting.studies.animations import AnimationFiles
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from support import gltf_files, grounds
-from support.commands import commands, refusal
+from support.commands import commands, refusal, replace_call
 from support.experiments import ROOT, write
 from support.sample_clips import BVH
 from support.watching import Recorder
@@ -54,15 +52,13 @@ def run(*words: object) -> None:
     assert main.main([str(word) for word in words]) == 0
 
 
-def test_every_command_has_a_function_and_examples_that_it_accepts():
-    names = {name.partition(" ")[0] for name in commands()}
-    assert names == {*COMMANDS, *without_jax.COMMANDS}
+def test_every_command_has_a_call_and_examples_that_it_accepts():
     for command, parser in commands().items():
         example = parser.format_help().partition("example:\n")[2]
         found = re.findall(rf"^  jaxik ({command}\b.*?)(?:   .*| > .*)?$", example, re.MULTILINE)
         assert found, command
         for words in found:
-            make_parser().parse_args(shlex.split(words))
+            assert callable(make_parser().parse_args(shlex.split(words)).call)
 
 
 def test_the_help_lists_all_commands_and_exit_statuses(capsys):
@@ -97,7 +93,7 @@ def test_wrong_words_are_rejected_and_an_old_one_still_works_and_says_the_new_on
 
 # Ctrl-C, as the command begins, at work, and as it ends
 COMMAND = """
-import signal, sys, time
+import dataclasses, signal, sys, time
 from fitting.cli import start
 
 class Hook:
@@ -110,8 +106,9 @@ def work(options):
         time.sleep(0.01)
 
 if sys.argv[1] == "example":
-    from fitting.cli import main
-    main._function = lambda command: work
+    from fitting.cli import main, parser
+    main._import_jax = lambda: None
+    parser.COMMANDS = [dataclasses.replace(command, call=work) for command in parser.COMMANDS]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if status := start.main():
     sys.exit(status)
@@ -147,7 +144,7 @@ def test_a_warning_of_another_library_comes_under_its_name(monkeypatch, capsys):
         warnings.warn_explicit("of a checkout", UserWarning, "/home/checkout/fitting/b.py", 1)
         return 0
 
-    monkeypatch.setattr(main, "_function", lambda command: work)
+    replace_call(monkeypatch, machine.doctor, work)
     with warnings.catch_warnings(action="always"):
         run("doctor")
     assert capsys.readouterr().err.splitlines() == [
@@ -193,7 +190,7 @@ def test_work_goes_on_when_nobody_reads_what_is_printed(mistake, monkeypatch, tm
         (tmp_path / "result").touch()
         return 3
 
-    monkeypatch.setattr(main, "_function", lambda command: work)
+    replace_call(monkeypatch, machine.doctor, work)
     (reader, out), (other, err) = os.pipe(), os.pipe()
     with os.fdopen(out, "w") as stdout, os.fdopen(err, "w", buffering=1) as stderr:
         monkeypatch.setattr(sys, "stdout", stdout)
@@ -449,7 +446,7 @@ def test_every_number_among_the_options_has_a_range_here():
         for action in parser._actions:
             if not action.option_strings or action.choices is not None or action.type is None:
                 continue
-            if getattr(action.type, "__module__", "").endswith("parsers.options"):
+            if getattr(action.type, "__module__", "").endswith("cli.options"):
                 numbers.setdefault(command, set()).add(action.option_strings[-1])
             else:  # a path, or a converter of other texts
                 assert action.type not in (int, float), action
@@ -524,7 +521,7 @@ COMPLETED = {
     "jaxik parameters --format ": {"text", "markdown", "json"},
     "jaxik record to-": {"to-toml", "to-bytes"},
     "jaxik fit uneven": {"uneven_walk.toml"},
-    "jaxik completion ": set(SHELLS),
+    "jaxik completion ": set(machine.SHELLS),
 }
 
 
@@ -544,8 +541,8 @@ def test_bash_completes_commands_options_choices_and_files(tmp_path, capsys):
 def test_there_is_a_script_for_each_shell_and_without_shtab_a_word_on_what_to_install(
     monkeypatch, capsys
 ):
-    assert set(SHELLS) == set(pytest.importorskip("shtab").SUPPORTED_SHELLS)
-    for shell in SHELLS:
+    assert set(machine.SHELLS) == set(pytest.importorskip("shtab").SUPPORTED_SHELLS)
+    for shell in machine.SHELLS:
         assert main.main(["completion", shell]) == 0
         assert "calibrate" in capsys.readouterr().out, shell
     monkeypatch.setitem(sys.modules, "shtab", None)

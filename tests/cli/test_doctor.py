@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from fitting.cli import examination, main, self_test, without_jax
+from fitting.cli import examination, main, self_test, status
 from fitting.cli.examination import Finding, from_json
 from fitting.experiment import problems
 from support import quick
@@ -39,7 +39,7 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
     assert done.stdout.endswith("\nall is well\n")
     (tmp_path / "jax.py").write_text("raise RuntimeError('no AVX')\n", encoding="utf-8")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path))
-    assert done.returncode == without_jax.PROBLEMS_FOUND
+    assert done.returncode == status.PROBLEMS_FOUND
     assert "jax cannot be imported: no AVX" in done.stdout and "processor" in done.stdout
 
 
@@ -47,7 +47,7 @@ def test_a_flag_that_ends_the_process_is_a_line_with_a_remedy(tmp_path, monkeypa
     monkeypatch.setattr(examination, "examine_installation", lambda: iter(()))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("XLA_FLAGS", "--xla_nonsense=1")
-    assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
+    assert main.main(["doctor", "--quick"]) == status.PROBLEMS_FOUND
     output = capsys.readouterr()
     assert "Unknown flag in XLA_FLAGS: --xla_nonsense=1" in output.out
     assert "do: unset XLA_FLAGS" in output.out and "Traceback" not in output.out + output.err
@@ -137,7 +137,7 @@ def test_little_memory_and_an_examination_that_fails_itself_are_problems(
     assert memory.fact == "4.0 GB, 0.5 GB of them free" and "only 0.5 GB" in memory.problem
     monkeypatch.setattr(examination, "examine_machine", Mock(side_effect=OSError("no such device")))
     monkeypatch.setattr(examination, "_in_other_process", lambda options: iter([Finding("a", "b")]))
-    assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
+    assert main.main(["doctor", "--quick"]) == status.PROBLEMS_FOUND
     out = capsys.readouterr().out
     assert "! machine: OSError: no such device\n  do: " in out and out.endswith("1 to mend\n")
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from fitting.cli import main
-from fitting.cli.commands import fits as commands
 from fitting.clips import Clip, flight, load_clip, save_clip
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.experiment import parameter_files, record_files, track_files
@@ -319,8 +318,8 @@ def test_what_the_record_has_no_room_for_is_not_free_but_what_its_reader_assumes
     aside = record_files.set_aside(experiment)
     assert aside["lock.lock_half_life"] == ("0.02 s", "0.05 s") and "probe.limited" in aside
     fitted = []
-    monkeypatch.setattr(commands.jobs, "fit", lambda entry, *_, **__: fitted.append(entry))
-    monkeypatch.setattr(commands.status, "of_fit", lambda _: 0)
+    monkeypatch.setattr("fitting.jobs.fit", lambda entry, *_, **__: fitted.append(entry))
+    monkeypatch.setattr("fitting.cli.status.of_fit", lambda _: 0)
     words = ["fit", str(write(tmp_path, top=TOP, free=FREE)), "-o", str(tmp_path)]
     assert main.main([*words, "--record-only"]) == main.main(words) == 0
     assert [experiment.record_only for experiment in fitted] == [True, False]

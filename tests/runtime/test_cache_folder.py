@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import jax
 import pytest
 
-from fitting.cli import main
+from fitting.cli import machine, main
 from fitting.runtime import cache_folder
 from fitting.runtime.cache_folder import (
     ENABLED,
@@ -20,6 +20,7 @@ from fitting.runtime.cache_folder import (
     SwitchedOffError,
     setting,
 )
+from support.commands import replace_call
 
 DIGEST = "0123456789abcdef" * 4
 
@@ -191,7 +192,7 @@ def test_what_cannot_be_kept_is_said_once_and_in_one_line(folder, monkeypatch, c
             warnings.warn(f"Error writing {main.JAX_CACHE} entry for '{name}': disk", stacklevel=1)
         return 0
 
-    monkeypatch.setattr("fitting.cli.commands.COMMANDS", {"cache": warn})
+    replace_call(monkeypatch, machine.cache, warn)
     jax.config.update(FOLDER, str(folder))
     assert main.main(["cache"]) == 0
     expected = f"jaxik: Error writing {main.JAX_CACHE} entry for 'jit_a': disk\n"

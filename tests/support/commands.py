@@ -1,16 +1,26 @@
 """The commands of `jaxik`: all that its parser knows, and what they do when they refuse."""
 
 import argparse
+import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
-from fitting.cli import main
+import pytest
+
+from fitting.cli import main, parser
+from fitting.cli.options import Call, Command
 from fitting.cli.parser import make_parser
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
     """The parser of each command by its words, `record` and `record show` among them."""
     return dict(_below(make_parser(), ""))
+
+
+def replace_call(monkeypatch: pytest.MonkeyPatch, command: Command, call: Call) -> None:
+    """Has a command do something else."""
+    replaced = {command: dataclasses.replace(command, call=call)}
+    monkeypatch.setattr(parser, "COMMANDS", [replaced.get(c, c) for c in parser.COMMANDS])
 
 
 def _below(parser: argparse.ArgumentParser, words: str):

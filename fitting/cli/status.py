@@ -1,8 +1,12 @@
 """Exit statuses of the commands."""
 
-from fitting.studies.fit.fit import Fit
-from fitting.studies.many.many_tasks import ManyFits
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from fitting.studies.fit.fit import Fit
+    from fitting.studies.many.many_tasks import ManyFits
+
+PROBLEMS_FOUND = 1  # by `doctor`
 NOT_CONVERGED = 3  # the search of a fit
 DOES_NOT_FIT = 4  # a fit that has converged
 OUTSIDE = 5  # of its bounds, a calibration
@@ -17,7 +21,7 @@ def of_job(*, interrupted: bool) -> int:
     return 0
 
 
-def of_fit(fitted: Fit) -> int:
+def of_fit(fitted: "Fit") -> int:
     """The exit status of a search; what a translation leaves over is a result, and no failure."""
     of_job(interrupted=fitted.solution.interrupted)
     if fitted.has_noise and fitted.distances.setbacks:
@@ -27,7 +31,7 @@ def of_fit(fitted: Fit) -> int:
     return DOES_NOT_FIT if fitted.has_noise and not fitted.verdict.fits else 0
 
 
-def of_many(fits: ManyFits) -> int:
+def of_many(fits: "ManyFits") -> int:
     """The exit status of many fits; whether each fits is a result, and no failure."""
     of_job(interrupted=fits.interrupted)
     if fits.failed:

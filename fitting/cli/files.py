@@ -1,0 +1,278 @@
+"""Commands that read and convert files."""
+
+import argparse
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fitting.runtime import activity
+from fitting.runtime.validation import error_context
+
+from .options import (
+    CLIP_GROUP,
+    CLIP_OPTIONS,
+    CLIP_UNITS,
+    Command,
+    argument,
+    clip_options,
+    command,
+    compiled,
+    flag,
+    group,
+    number,
+    output,
+    subcommands,
+)
+from .terminal import show
+
+if TYPE_CHECKING:
+    from jaxik.record import Reading, Record
+
+TEMPLATE = Path()
+"""What `--joints` is without a file: no name that a file can have."""
+
+
+@command(
+    argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf, .c3d or .npz"),
+    flag("--json", "as JSON"),
+    group(
+        CLIP_GROUP,
+        argument(
+            "--joints", type=Path, nargs="?", const=TEMPLATE, metavar="MAP.toml",
+            help="which joint is which; without a file, print a map of this clip to be edited",
+        ),
+        *CLIP_UNITS,
+    ),
+)  # fmt: skip
+def inspect(options: argparse.Namespace) -> int:
+    """Print what a loader understood of a clip.
+
+    jaxik inspect walk.bvh
+    jaxik inspect walk.amc --asf skeleton.asf --json
+    jaxik inspect walk.bvh --joints > map.toml     a joint map to be edited, and then used:
+    jaxik inspect walk.bvh --joints map.toml
+    """
+    from fitting.clips import load_clip, summary
+    from fitting.clips.load import draft_joint_map
+    from fitting.report.formatting import TableText
+
+    how = clip_options(options)
+    if options.joints == TEMPLATE:
+        if options.json:
+            raise ValueError("--json is for what was understood, and not for a joint map")
+        with activity.announced(f"Reading {options.clip.name}"):
+            drafted = draft_joint_map(options.clip, how)
+        print(drafted)
+        return 0
+    with activity.announced(f"Reading {options.clip.name}"):
+        clip = load_clip(options.clip, **vars(how))
+    described = summary.describe(clip)
+    if options.json:
+        print(summary.as_json(described))
+    else:
+        show(TableText(summary.as_text(described), summary.rows(described), is_prose=True))
+    return 0
+
+
+@command(
+    argument(
+        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf, .c3d or .npz",
+    ),
+    output("MESH", ".ply, .obj or .stl"),
+    argument(
+        "--model", choices=("auto", "plane", "smooth", "blocks"), default="auto",
+        help="what is written (default: chosen by the error of prediction)",
+    ),
+    argument(
+        "--margin", type=number(0, 100, "metres"), default=1.0, metavar="M",
+        help="of ground around the stances, m",
+    ),
+    CLIP_OPTIONS,
+)  # fmt: skip
+@compiled
+def terrain(options: argparse.Namespace) -> int:
+    """Reconstruct the ground of a captured clip from its stances.
+
+    jaxik terrain walk.bvh -o ground.ply
+    jaxik terrain walk.amc -o ground.obj --sole 0.045 --model smooth --margin 2
+
+    Three models are fitted to the stances: a plane, a smooth surface, and level blocks on a
+    grid. The table shows how well each predicts a stance from all the others; the simplest one
+    that is not clearly worse is written. A plot and all numbers go beside it: ground.png,
+    ground.json.
+    """
+    from fitting.clips import load_clip
+    from fitting.ground.reconstruction import reconstruct
+    from fitting.report.formatting import aligned
+    from fitting.studies import terrain_report
+
+    terrain_report.check_output_files(options.output)
+    with activity.announced(f"Reading {options.clip.name}"):
+        clip = load_clip(options.clip, **vars(clip_options(options)))
+    kind = None if options.model == "auto" else options.model
+    with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
+        ground = reconstruct(clip, kind=kind)
+    with activity.announced("Drawing and writing the ground"):
+        terrain_report.write(options.output, ground, clip, options.margin)
+    print(f"{terrain_report.count_stances(ground)}\n")
+    show(aligned(terrain_report.prediction_table(ground)))
+    print(f"\n{terrain_report.describe_surface(ground)}; written to {options.output}")
+    return 0
+
+
+RECORD_UNITS = (
+    argument(
+        "--length-unit", choices=("auto", "m", "cm"), default="auto",
+        help="of rays and ankle heights in the record (default: by their size)",
+    ),
+    argument(
+        "--knee", choices=("interior", "flexion"), default="interior",
+        help="which angle the record's knee limits are (default: interior)",
+    ),
+    argument("--lean-sign", type=int, choices=(1, -1), default=1, help="of the undulation rates"),
+    argument(
+        "--tick-hz", type=number(1, 1000, "Hz"), default=30.0,
+        help="rate of the gains' ticks (default: 30)",
+    ),
+)  # fmt: skip
+
+
+@command(
+    argument("file", type=Path, help="binary record, .csv or parameter .toml"),
+    flag("--csv", "as CSV with the record's own names"),
+    *RECORD_UNITS,
+    name="show",
+)
+@compiled
+def show_record(options: argparse.Namespace) -> int:
+    """Print a record with its own names and ours.
+
+    jaxik record show footik.bin
+    jaxik record show footik.bin --csv > footik.csv
+    """
+    from fitting.experiment import record_files
+    from jaxik.record import to_csv
+
+    units = _record_units(options)
+    records = record_files.read(options.file, units, None, drop=True)  # of what is only shown
+    if options.csv:
+        print(to_csv(records).rstrip())
+    else:
+        with error_context(options.file):
+            print("\n\n".join(record_files.describe(entry, units) for entry in records))
+    return 0
+
+
+@command(argument("file", type=Path, help="binary record or .csv"), output("TOML"), *RECORD_UNITS)
+@compiled
+def to_toml(options: argparse.Namespace) -> int:
+    """A record as parameters with our names and units.
+
+    jaxik record to-toml footik.bin --length-unit cm -o footik.toml
+    """
+    from fitting.experiment import parameter_files, record_files, systems
+    from fitting.runtime import files
+    from jaxik.record import Record, besides_parameters, to_ik
+
+    units = _record_units(options)
+    only = _only_record(options.file, record_files.read(options.file, units, None, drop=True))
+    with error_context(options.file):
+        ik = to_ik(only, units)
+        text = parameter_files.system_to_toml(ik, systems.Preset("record", faithful=True))
+    files.write_text(options.output, text)
+    if (rest := besides_parameters(only)) != besides_parameters(Record()):
+        warnings.warn(
+            f"{', '.join(rest)}: no parameters, so not in {options.output}; `record to-bytes` "
+            f"takes them from --base {options.file}",
+            stacklevel=2,
+        )
+    print(f"written to {options.output}")
+    return 0
+
+
+@command(
+    argument("file", type=Path, help="parameter .toml, or .csv"),
+    output("BIN"),
+    argument("--base", type=Path, help="record with padding, tail and knee axis"),
+    flag("--drop", "leave out what the record has no room for"),
+    *RECORD_UNITS,
+)
+@compiled
+def to_bytes(options: argparse.Namespace) -> int:
+    """Parameters as a binary record.
+
+    jaxik record to-bytes footik.toml --base footik.bin -o edited.bin
+
+    With the record that `to-toml` read as the base, and the same options, everything that was
+    not edited comes out unchanged, to the byte. Parameters for which the record has no room are
+    named, and nothing is written, unless --drop leaves them out.
+    """
+    from fitting.experiment import record_files
+    from fitting.runtime import files
+    from jaxik.record import to_bytes as as_bytes
+
+    base = None if options.base is None else record_files.read_binary(options.base)
+    records = record_files.read(options.file, _record_units(options), base, drop=options.drop)
+    only = _only_record(options.file, records)
+    files.write(options.output, lambda path: path.write_bytes(as_bytes(only)))
+    print(f"written to {options.output}")
+    return 0
+
+
+def _record_units(options: argparse.Namespace) -> "Reading":
+    """What `RECORD_UNITS` add."""
+    from jaxik.record import Reading
+
+    return Reading(options.length_unit, options.knee, options.lean_sign, options.tick_hz)
+
+
+def _only_record(path: Path, records: "Sequence[Record]") -> "Record":
+    """The record of a file that must not hold several."""
+    (only, *more) = records
+    if more:
+        raise ValueError(f"{path} has {1 + len(more)} rows; give a file with one record")
+    return only
+
+
+record = Command(
+    "record",
+    """Show or convert the game's parameter record.
+
+    jaxik record show footik.bin
+    jaxik record to-toml footik.bin -o footik.toml
+    jaxik record to-bytes footik.toml --base footik.bin -o edited.bin
+    """,
+    (subcommands("show|to-toml|to-bytes", show_record, to_toml, to_bytes),),
+)
+
+
+@command(
+    argument(
+        "source", type=Path, metavar="SOURCE",
+        help="folder of a run, parameter .toml or .json, record .bin or .csv, or settings",
+    ),
+    output("FILE", ".toml, .json, .csv or .bin"),
+    argument(
+        "--as", dest="system", choices=("ozz", "unreal", "mec"),
+        help="write the settings of this system (default: parameters, or a record)",
+    ),
+    flag("--drop", "leave out what the record or settings cannot hold"),
+)  # fmt: skip
+def export(options: argparse.Namespace) -> int:
+    """Write parameters as TOML, JSON, the game's record, or settings.
+
+    jaxik export runs/walk -o walk.json               parameters under our names
+    jaxik export runs/walk -o footik.bin              the game's record, or as .csv
+    jaxik export runs/walk --as unreal -o walk.csv    settings under Unreal's names, in cm
+    jaxik export walk.csv -o parameters.toml          and back
+
+    What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
+    it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's
+    inspector, as .toml, .json or .csv.
+    """
+    from fitting import jobs
+
+    jobs.export(options.source, options.output, system=options.system, drop=options.drop)
+    print(f"written to {options.output}")
+    return 0
