@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -10,8 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from fitting.runtime import validation
-
-from .terminal import can_draw
 
 if TYPE_CHECKING:
     from fitting.clips.load import ClipOptions
@@ -45,7 +42,7 @@ class Command:
             help=summary[:1].lower() + summary[1:].rstrip("."),
             description=summary,
             epilog="example:\n" + textwrap.indent(textwrap.dedent(example).strip(), "  "),
-            formatter_class=help_formatter(),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         parser.set_defaults(call=self.call, parser=parser, needs_jax=self.needs_jax)
         for add in self.options:
@@ -73,21 +70,6 @@ def compiled(call: Call) -> Call:
         return precision.in_float64(call)(options)
 
     return run
-
-
-def help_formatter() -> type[argparse.HelpFormatter]:
-    """The class that lays out help: in colour on a terminal; descriptions stay as they are."""
-    if not can_draw(sys.stdout):
-        return argparse.RawDescriptionHelpFormatter
-    try:
-        from rich_argparse import RawDescriptionRichHelpFormatter
-    except ImportError:  # `jaxik doctor` says so, and must be able to
-        return argparse.RawDescriptionHelpFormatter
-
-    class HelpFormatter(RawDescriptionRichHelpFormatter):
-        text_markup = help_markup = False  # brackets are those of TOML
-
-    return HelpFormatter
 
 
 def argument(*names: str, **properties: Any) -> Option:

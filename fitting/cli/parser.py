@@ -2,12 +2,15 @@
 
 import argparse
 import re
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from fitting.runtime.validation import in_one_line
 
 from . import animations, files, fits, guides, machine
-from .options import help_formatter
+from .terminal import show_help
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 EXAMPLES = """examples:
   jaxik init walk.bvh -o walk                                  a first experiment of your clip
@@ -58,7 +61,15 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        self.color = False  # which Python 3.14 would add to ours
         self._negative_number_matcher = re.compile(r"-(\.?\d|inf)")  # or -1e3 is an option
+
+    def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
+        """Prints the help, in colour on a terminal."""
+        if file is None:
+            show_help(self.format_help())
+        else:
+            super().print_help(file)
 
     def error(self, message: str) -> NoReturn:
         """Prints what is wrong with the words, without the usage, and exits."""
@@ -72,7 +83,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog="jaxik",
         description="Fits the parameters of foot IK to captured motion, with their uncertainty.",
         epilog=EXAMPLES,
-        formatter_class=help_formatter(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in COMMANDS:

@@ -38,8 +38,10 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
     assert f"jax {metadata.version('jax')}," in done.stdout
     assert done.stdout.endswith("\nall is well\n")
     (tmp_path / "jax.py").write_text("raise RuntimeError('no AVX')\n", encoding="utf-8")
+    (tmp_path / "rich.py").write_text("raise ImportError('not here')\n", encoding="utf-8")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path))
     assert done.returncode == status.PROBLEMS_FOUND
+    assert "rich cannot be imported: not here" in done.stdout
     assert "jax cannot be imported: no AVX" in done.stdout and "processor" in done.stdout
 
 

@@ -106,8 +106,11 @@ def test_what_is_too_wide_becomes_two_tables_which_begin_alike_or_prose_below(mo
         assert " ".join(" ".join(lines[1:]).split()) == f"leg.max_knee_angle {prose}"
 
 
-@pytest.mark.parametrize("words", [["--help"], ["fit", "--help"]])
-def test_help_has_colours_on_a_terminal_only(words, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("words", "marked"),
+    [(["--help"], ["-h", "fit-many"]), (["fit", "--help"], ["-o", "--record-only"])],
+)
+def test_help_has_colours_on_a_terminal_only(words, marked, monkeypatch, capsys):
     def ask() -> None:
         with pytest.raises(SystemExit, match="0"):
             main.main(words)
@@ -115,7 +118,8 @@ def test_help_has_colours_on_a_terminal_only(words, monkeypatch, capsys):
     drawn = on_terminal(monkeypatch, ask)
     ask()
     plain = capsys.readouterr().out
-    assert ESCAPE in drawn and ESCAPE not in plain
+    assert all(f"{ESCAPE}[36m{word}" in drawn for word in marked)
+    assert f"{ESCAPE}[1musage:" in drawn and ESCAPE not in plain
     examples_of = [text.rpartition("example")[2].split() for text in (CODES.sub("", drawn), plain)]
     assert examples_of[0] == examples_of[1]
 

@@ -33,7 +33,7 @@ REASONS = {
         ("(flat_ankle, axis=-1)", "(flat_ankle, axis=1)", "there are two axes")
     ],
     "fitting/bench/report.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
-    "fitting/cli/terminal.py": [
+    "fitting/cli/drawing.py": [
         ("default=0", "default= 1", "the longest word counts only where it is long")
     ],
     "fitting/clips/formats/gltf_writer.py": [("GREY = [", "", LOOK)],
