@@ -462,6 +462,17 @@ def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters_or_i
     assert {0.61, 0.55} <= first_coordinates(axes)[0]
 
 
+def test_contours_hold_the_parts_of_the_samples_that_the_legend_says():
+    u = np.random.default_rng(0).normal(size=(500, 40, 2)) @ np.array([[1.0, 0.8], [0.0, 0.3]])
+    posterior = posterior_of(NAMES, u, u, burn_in=0)
+    figure = posterior_plots.corner(posterior, NAMES, {}, None, "two")
+    contours = figure.axes[2].collections[-1]
+    inside = [path.contains_points(u.reshape(-1, 2)).mean() for path in contours.get_paths()]
+    assert inside == pytest.approx([0.86, 0.39], abs=0.04)
+    ends = first_coordinates(figure.axes[0])[0]
+    assert ends >= {*np.quantile(u[..., 0], (0.025, 0.975))}
+
+
 def test_the_legend_of_a_chain_says_how_many_of_its_walkers_are_drawn():
     figure = posterior_plots.chain(invented_posterior(), list(VALUES), None, "chain")
     assert [len(axes.lines) for axes in figure.axes] == [12] * (1 + len(VALUES))

@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import corner as corner_library
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from scipy.ndimage import gaussian_filter
 
 from fitting.inference.sample.posterior import Posterior
 from fitting.problem.space import Space, prior_probability
@@ -16,6 +17,8 @@ SAMPLES = 20_000  # at most, in the corner
 WALKERS = 40  # at most, in the picture of the chain
 POINTS = 1500  # at most, of each walker
 BINS = 30  # of a histogram
+SMOOTHING = 0.8  # bins, of the density of a pair
+HELD = (0.86, 0.39)  # by contours: two and one standard deviations of a normal in two dimensions
 MARGIN = 0.05  # fraction of a panel's width
 
 
@@ -39,32 +42,31 @@ def corner(
     ranges = [_range(samples[:, i], [values[i] for values in marks]) for i in range(size)]
     inches = 1.2 + max(size, 3) * (2.2 if size <= 6 else 1.75)
     font_size = 15 if size <= 6 else 11
-    figure = Figure(figsize=(inches, inches), dpi=100)
-    corner_library.corner(
-        samples,
-        fig=figure,
-        bins=BINS,
-        range=ranges,
-        labels=[label.replace(".", ".\n", 1) for label in labels],
-        label_kwargs={"fontsize": font_size},
-        labelpad=0.12 if size <= 6 else 0.25,
-        quantiles=[0.025, 0.975],
-        color=AFTER,
-        plot_datapoints=False,
-        fill_contours=True,
-        smooth=0.8,
-        levels=(0.39, 0.86),  # one and two standard deviations of a normal in two dimensions
-        max_n_ticks=3,
-    )
-    for axes in figure.axes:
+    figure = Figure(figsize=(inches, inches), dpi=100, layout="constrained")
+    panels = figure.subplots(size, size, sharex="col", squeeze=False)
+    for (row, column), axes in np.ndenumerate(panels):
         axes.grid(False)
-        axes.tick_params(labelsize=font_size - 2)
+        axes.tick_params(labelsize=font_size - 2, labelrotation=45, labelleft=column == 0)
+        if column > row:
+            axes.set_axis_off()
+        elif column < row:
+            pair = [column, row]
+            _draw_pair(axes, samples[:, pair], [ranges[i] for i in pair])
+            axes.locator_params(nbins=3)
+        else:
+            _draw_histogram(axes, samples[:, row], ranges[row])
+    for i, label in enumerate(labels):
+        label = label.replace(".", ".\n", 1)
+        panels[-1, i].set_xlabel(label, fontsize=font_size)
+        if i:
+            panels[i, 0].set_ylabel(label, fontsize=font_size)
+    figure.align_labels()
     for values, colour, dashes in zip(marks, (BEFORE, CAPTURED), ("--", "-"), strict=True):
-        _draw_values(figure, values, color=colour, linestyle=dashes, linewidth=1.8)
+        _draw_values(panels, values, color=colour, linestyle=dashes, linewidth=1.8)
     if space is not None:
         edges = np.stack([np.linspace(*ends, BINS + 1) for ends in ranges], axis=1)
         expected = len(samples) * np.diff(prior_probability(space, edges), axis=0)
-        for i, axes in enumerate(figure.axes[:: size + 1]):  # the diagonal
+        for i, axes in enumerate(panels.diagonal()):
             axes.stairs(expected[:, i], edges[:, i], color=PRIOR, linewidth=1.8)
             axes.set_ylim(0, max(axes.get_ylim()[1], 1.1 * expected[:, i].max()))
     entries = [
@@ -84,14 +86,39 @@ def corner(
     return figure
 
 
-def _draw_values(figure: Figure, values: Sequence[float | None], **style: Any) -> None:
-    """Lines at known values; `corner.overplot_lines` fails with a single parameter."""
-    grid = np.reshape(np.array(figure.axes), (len(values), len(values)))
+def _draw_histogram(axes: Axes, values: np.ndarray, ends: tuple[float, float]) -> None:
+    """The samples of a parameter, and the ends of their 95 % interval."""
+    counts, *_ = axes.hist(values, bins=BINS, range=ends, histtype="step", color=AFTER)
+    for end in np.quantile(values, (0.025, 0.975)):
+        axes.axvline(end, color=AFTER, linestyle="--")
+    axes.set_xlim(ends)
+    axes.set_ylim(0, 1.1 * np.max(counts))
+    axes.set_yticks([])
+    axes.locator_params("x", nbins=3)
+
+
+def _draw_pair(axes: Axes, pairs: np.ndarray, ends: Sequence[tuple[float, float]]) -> None:
+    """Contours around the densest samples of two parameters, (samples, 2)."""
+    counts, _ = np.histogramdd(pairs, BINS, ends)
+    density = gaussian_filter(counts, SMOOTHING)
+    order = np.argsort(density, axis=None)[::-1]
+    held = np.cumsum(counts.ravel()[order]) / np.sum(counts)
+    heights = np.unique(density.ravel()[order[np.searchsorted(held, HELD)]])
+    x, y = (low + (high - low) / BINS * (np.arange(-1, BINS + 1) + 0.5) for low, high in ends)
+    padded = np.pad(density, 1, "edge").T  # to the border of the panel
+    colours = [(AFTER, 1 / 3), (AFTER, 1.0)][-len(heights) :]
+    axes.contourf(x, y, padded, [*heights, 2 * density.max()], colors=colours)
+    axes.contour(x, y, padded, heights, colors=AFTER)
+    axes.set(xlim=ends[0], ylim=ends[1])
+
+
+def _draw_values(panels: np.ndarray, values: Sequence[float | None], **style: Any) -> None:
+    """Lines at known values."""
     for i, value in enumerate(values):
         if value is not None:
-            for axes in grid[i:, i]:
+            for axes in panels[i:, i]:
                 axes.axvline(value, **style)
-            for axes in grid[i, :i]:
+            for axes in panels[i, :i]:
                 axes.axhline(value, **style)
 
 
