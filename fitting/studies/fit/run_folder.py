@@ -38,7 +38,7 @@ from fitting.runtime import activity
 from fitting.runtime.claimed_folder import LOCK
 from fitting.runtime.files import TEMPORARY, write_text
 from fitting.runtime.json_files import JsonFile, check_version, write_json
-from fitting.runtime.validation import Content, error_context, flatten, read_toml
+from fitting.runtime.validation import Content, flatten, read_toml
 from fitting.studies.sample.predictive import Band, PredictiveCheck, Statistic
 from fitting.studies.sample.replay import Replay
 from fitting.studies.sample.sample import SampledFit
@@ -136,7 +136,7 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
         ValueError: the folder holds no finished fit, or a clip of its experiment is gone.
     """
     _check_files(run, (EXPERIMENT, FIT, PARAMETERS))
-    summary = _load_summary(run)
+    summary = FIT_FILE.read(run / FIT, _check_numbers)
     _check_toml_format(run / EXPERIMENT)
     experiment = experiment_files.load_experiment(run / EXPERIMENT)
     if "distances" not in summary:  # of an earlier release, with its defaults
@@ -156,7 +156,7 @@ def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
     path = run / PARAMETERS
     if (run / FIT).exists() or (run / SEARCH).exists():  # without both, the parameters came alone
         _check_files(run, (FIT,))
-        _check_has_parameters(path, _load_summary(run))
+        _check_has_parameters(path, FIT_FILE.read(run / FIT, _check_numbers))
     _check_toml_format(path)
     ik, _ = parameter_files.load_system(path, rig)
     return ik
@@ -186,13 +186,6 @@ def _check_files(run: Path, names: Sequence[str]) -> None:
             raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
 
 
-def _load_summary(run: Path) -> FitSummary:
-    summary = FIT_FILE.read(run / FIT)
-    with error_context(f"{run / FIT}: not the numbers of a fit"):
-        _check_numbers(summary)
-    return summary
-
-
 def _check_numbers(summary: FitSummary) -> None:
     """Raises ValueError where the numbers of a fit contradict each other."""
     if "noise" in summary:
@@ -200,13 +193,13 @@ def _check_numbers(summary: FitSummary) -> None:
     rows = summary["parameters"]
     names = [row["name"] for row in rows]
     if len(set(names)) < len(names):
-        raise ValueError(f"its parameters are {names}; wanted each once; {HINT}")
+        raise ValueError(f"its parameters are {names}; wanted each once")
     for row in rows:
         for valley in row.get("valleys", ()):
             if len(valley.get("values", rows)) != len(rows):
                 raise ValueError(
                     f"a valley of {row['name']} has {len(valley.get('values', ()))} values; wanted "
-                    f"{len(rows)}, one of each parameter; {HINT}"
+                    f"{len(rows)}, one of each parameter"
                 )
 
 
