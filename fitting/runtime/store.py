@@ -38,15 +38,15 @@ class Store(Generic[Result]):
             key: entries that it must have.
 
         Raises:
-            ValueError: as `recall` and `keep`.
+            ValueError: as `read` and `write`.
         """
-        result = self.recall(name, key)
+        result = self.read(name, key)
         if result is None:
             result = compute()
-            self.keep(name, result)
+            self.write(name, result)
         return result
 
-    def recall(self, name: str, key: Table = NO_KEY) -> Result | None:
+    def read(self, name: str, key: Table = NO_KEY) -> Result | None:
         """The stored result; None if there is none.
 
         Raises:
@@ -61,7 +61,7 @@ class Store(Generic[Result]):
             raise ValueError(f"{path}: {other}; {self.kind.advice}")
         return result
 
-    def keep(self, name: str, result: Mapping[str, Any]) -> None:
+    def write(self, name: str, result: Mapping[str, Any]) -> None:
         """Stores a result in place of that which is there.
 
         Raises:
@@ -72,7 +72,7 @@ class Store(Generic[Result]):
             path.parent.mkdir(parents=True, exist_ok=True)
             self.kind.write(path, result)
 
-    def forget(self, name: str) -> None:
+    def remove(self, name: str) -> None:
         """Deletes a result, if it is there."""
         if self.folder is not None:
             (self.folder / name).unlink(missing_ok=True)

@@ -348,7 +348,7 @@ def read(folder: Path | None) -> list[Row]:
     Raises:
         ValueError: the file is something else.
     """
-    stored = Store(ROWS_FILE, folder, check=_rows).recall(NUMBERS)
+    stored = Store(ROWS_FILE, folder, check=_rows).read(NUMBERS)
     return [] if stored is None else _rows(stored)
 
 
@@ -366,7 +366,7 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
     content = [asdict(row) for row in rows]
     for row in content:  # JSON has no NaN
         row["agreement"] = {k: None if math.isnan(v) else v for k, v in row["agreement"].items()}
-    Store(ROWS_FILE, folder).keep(NUMBERS, {"rows": content})
+    Store(ROWS_FILE, folder).write(NUMBERS, {"rows": content})
 
 
 def row_text(row: Row) -> str:

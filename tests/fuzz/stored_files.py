@@ -93,7 +93,7 @@ def found_text() -> bytes:
 
 def load_found(path: Path) -> None:
     """As `jaxik population` reads it."""
-    found = population.search_store(path.parent, 2).recall(path.name)
+    found = population.search_store(path.parent, 2).read(path.name)
     assert found is not None and np.isfinite([*found["u"], found["cost"]]).all()
 
 

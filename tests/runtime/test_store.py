@@ -36,7 +36,7 @@ def test_a_result_is_computed_once_and_an_interrupt_stores_nothing(tmp_path):
     sums = store(tmp_path / "new" / "sums")
     with pytest.raises(KeyboardInterrupt):
         sums.remember("one.json", fail, KEY)
-    assert not list(tmp_path.iterdir()) and sums.recall("one.json") is None
+    assert not list(tmp_path.iterdir()) and sums.read("one.json") is None
     assert sums.remember("one.json", lambda: ONE, KEY) == ONE
     assert sums.remember("one.json", fail, KEY) == ONE
 
@@ -51,7 +51,7 @@ def test_without_a_folder_nothing_is_remembered(tmp_path, monkeypatch):
 
 def test_a_result_of_another_key_and_one_that_cannot_be_are_refused_and_stay(tmp_path):
     sums, path = store(tmp_path), tmp_path / "one.json"
-    sums.keep(path.name, ONE)
+    sums.write(path.name, ONE)
     whole = path.read_text()
     with pytest.raises(ValueError, match=r"one\.json: the sum of 'a', with another identity; add"):
         sums.remember(path.name, fail, {"identity": "b"})

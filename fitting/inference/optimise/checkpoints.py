@@ -130,7 +130,7 @@ class Checkpoints:
         self._path, self._warn, self._written = Path(folder or "", name), warn, -np.inf
         begun: StoredSearches = {"identity": identity, "searches": {}, "profiles": {}}
         try:
-            self._content = self._store.recall(name, {"identity": identity}) or begun
+            self._content = self._store.read(name, {"identity": identity}) or begun
         except ValueError as error:
             self._content = begun
             warn(f"{error}")
@@ -205,12 +205,12 @@ class Checkpoints:
     def flush(self) -> None:
         """Writes what is not on disk yet."""
         if self.count or self.profile_count:
-            self._store.keep(self._path.name, self._content)
+            self._store.write(self._path.name, self._content)
             self._written = time.monotonic()
 
     def remove(self) -> None:
         """Deletes the file: the fit is finished."""
-        self._store.forget(self._path.name)
+        self._store.remove(self._path.name)
 
     def _write(self) -> None:
         if time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES:

@@ -228,14 +228,14 @@ class _Stage:
         other = f"not {WRITER}: it is of replicate {{number}}"
         store: Store[Any] = Store(FILES[self.name], self.folder, other, self._check)
         paths = [f"{self.name}/{number:04}.json" for number in range(self.replicates)]
-        stored = [store.recall(path, {"number": number}) for number, path in enumerate(paths)]
+        stored = [store.read(path, {"number": number}) for number, path in enumerate(paths)]
         results: dict[int, Result] = {n: row for n, row in enumerate(stored) if row is not None}
         missing = [number for number in range(self.replicates) if number not in results]
         computed = self._compute_here if self.client is None else self._compute_on_cluster
         title = f"Making the {WORDS[self.name]} of {self.replicates} replicates"
         with activity.announced(title, self.replicates, done=len(results)) as making:
             for number, result in computed(make, arguments, missing):
-                store.keep(paths[number], result)
+                store.write(paths[number], result)
                 results[number] = result
                 on_result(result)
                 making.advance()

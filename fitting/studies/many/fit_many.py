@@ -36,10 +36,10 @@ from .many_tasks import (
     Tally,
     failed_row,
     finished_row,
-    keep_row,
     outcome_of,
     plan,
-    recall_row,
+    read_row,
+    write_row,
 )
 
 if TYPE_CHECKING:
@@ -232,14 +232,14 @@ def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
     try:
         _check_shared_folder(folder)
         with warnings.catch_warnings(record=True) as caught, waiting_for(run.with_suffix(".lock")):
-            if (row := recall_row(folder, task)) is not None:
+            if (row := read_row(folder, task)) is not None:
                 return row  # of another worker that was thought to be dead
             warnings.simplefilter("default")
             fitted = _fit(run, task.experiment, report, watch)
         notes = list(dict.fromkeys(in_one_line(Warning(note.message)) for note in caught))
         row = finished_row(task, outcome_of(fitted), watch.read(), notes)
         (run / ERROR).unlink(missing_ok=True)
-        keep_row(folder, row)
+        write_row(folder, row)
         return row
     except Exception as error:
         if not isinstance(error, ValueError | OSError):  # which are told in a sentence

@@ -249,7 +249,7 @@ def failed_row(task: FitTask, error: str) -> Row:
     return _row(task, "failed", error)
 
 
-def recall_row(folder: Path, task: FitTask) -> Row | None:
+def read_row(folder: Path, task: FitTask) -> Row | None:
     """The row of a fit that is whole already, in the folder of all fits; None if there is none.
 
     Raises:
@@ -258,12 +258,12 @@ def recall_row(folder: Path, task: FitTask) -> Row | None:
     name = f"{task.run / ROW}"
     if not (folder / name).is_file():
         return None  # without the identity, which takes reading all of the clips
-    return _store(folder).recall(name, {"identity": task.identity()})
+    return _store(folder).read(name, {"identity": task.identity()})
 
 
-def keep_row(folder: Path, row: Row) -> None:
+def write_row(folder: Path, row: Row) -> None:
     """Says that a run is whole."""
-    _store(folder).keep(f"{row['run']}/{ROW}", row)
+    _store(folder).write(f"{row['run']}/{ROW}", row)
 
 
 def _store(folder: Path) -> Store[Row]:
@@ -351,7 +351,7 @@ class Tally:
             ValueError: the folder has the fit of an experiment that was changed since.
         """
         self.folder, self.tasks = folder, tasks
-        rows = [recall_row(folder, task) for task in tasks]
+        rows = [read_row(folder, task) for task in tasks]
         self.missing = [task for task, row in zip(tasks, rows, strict=True) if row is None]
         """The fits that are to be made."""
         runs = [task.run.as_posix() for task in tasks]
@@ -368,7 +368,7 @@ class Tally:
     def look_again(self) -> None:
         """Takes the rows that were written and not yet told of, as an interrupt came between."""
         for task in self.missing:
-            if self._rows[task.run.as_posix()] is None and (row := recall_row(self.folder, task)):
+            if self._rows[task.run.as_posix()] is None and (row := read_row(self.folder, task)):
                 self.add(row)
 
     def progress(self) -> ManyProgress:
