@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -234,43 +234,40 @@ class _Recall:
     position: int = 0
 
     def __call__(self, search: Search, name: str, state: SearchState, stage: Stage) -> SearchState:
-        stored = self.stages[self.position] if self.position < len(self.stages) else None
-        self.position += 1
-        if stored is not None:
-            after = _restored(stored, state)
+        used_up = False
+        if self.position < len(self.stages):
+            stored = self.stages[self.position]
+            after, used_up = _restored(stored, state), stored["used_up"]
             search.observe(after)
-            if stored["used_up"]:
-                raise StepsUsedUp(after)
-            return after
-        try:
-            after = stage()
-        except StepsUsedUp as error:
-            self._keep(name, state, error.state, used_up=True)
-            raise
-        self._keep(name, state, after)
+        else:
+            try:
+                after = stage()
+            except StepsUsedUp as error:
+                after, used_up = error.state, True
+            self.stages.append(_stored(name, state, after, used_up))
+            self.write()
+        self.position += 1
+        if used_up:
+            raise StepsUsedUp(after)
         return after
 
-    def _keep(
-        self, name: str, before: SearchState, after: SearchState, *, used_up: bool = False
-    ) -> None:
-        added = after.history[len(before.history) :]
-        elite = after.elite
-        self.stages.append(
-            {
-                "name": name,
-                "point": _stored_point(after.point),
-                "best": _stored_point(after.best),
-                "random": dict(after.random.bit_generator.state),
-                "converged": after.converged,
-                "start_steps": after.start_steps,
-                "steps": after.steps,
-                "sweeps": after.sweeps,
-                "elite": elite and {"u": elite.u.tolist(), "cost": elite.cost.tolist()},
-                "history": [dataclasses.asdict(line) for line in added],
-                "used_up": used_up,
-            }
-        )
-        self.write()
+
+def _stored(name: str, before: SearchState, after: SearchState, used_up: bool) -> StoredStage:
+    """A stage that led from one state to another."""
+    elite = after.elite
+    return {
+        "name": name,
+        "point": _stored_point(after.point),
+        "best": _stored_point(after.best),
+        "random": dict(after.random.bit_generator.state),
+        "converged": after.converged,
+        "start_steps": after.start_steps,
+        "steps": after.steps,
+        "sweeps": after.sweeps,
+        "elite": elite and {"u": elite.u.tolist(), "cost": elite.cost.tolist()},
+        "history": [dataclasses.asdict(line) for line in after.history[len(before.history) :]],
+        "used_up": used_up,
+    }
 
 
 def _stored_point(point: Point) -> StoredPoint:
@@ -292,7 +289,7 @@ def _restored(stored: StoredStage, before: SearchState) -> SearchState:
         steps=stored["steps"],
         sweeps=stored["sweeps"],
         elite=elite and Elite(np.array(elite["u"]), np.array(elite["cost"])),
-        history=(*before.history, *(_line(line) for line in stored["history"])),
+        history=(*before.history, *(Progress(**line) for line in stored["history"])),
     )
 
 
@@ -311,7 +308,3 @@ def _point(stored: StoredPoint, before: SearchState) -> Point:
         if np.array_equal(u, known.u) and stored["cost"] == known.cost:
             return known
     return Point(u, stored["cost"])
-
-
-def _line(stored: Any) -> Progress:
-    return Progress(**stored)
