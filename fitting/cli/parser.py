@@ -41,9 +41,10 @@ EXAMPLES = """examples:
 exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake in the input, 3 when the
 search of `fit`, `fit-many`, `population` or `translate` has not converged, 4 when `fit` has
 converged but does not fit, 5 when `calibrate` finds something outside its bounds, 6 when a fit of
-`fit-many` has failed, 130 when interrupted with Ctrl-C, which is how `view` ends, with 0: `fit`
-then has written the best point so far, `sample` its chain, `ablate`, `calibrate`, `fit-many` and
-`population` each finished fit, and `compare --suite` each finished situation.
+`fit-many` has failed, 7 when a fit is worse than the animation or the system before it, 130 when
+interrupted with Ctrl-C, which is how `view` ends, with 0: `fit` then has written the best point so
+far, `sample` its chain, `ablate`, `calibrate`, `fit-many` and `population` each finished fit, and
+`compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.
 """
 
