@@ -8,14 +8,8 @@ them, so `log=print` shows the same.
 Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
 bits; a system that was made in 32 bits is taken with the values it has there.
 
-`drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample` and
-`translate`. `ablations` leaves rules out: `ablate`. `calibrations` judges what fits say:
-`calibrate` and
-`calibrate_wrong_model`. `populations` fits several clips and subjects: `population`. `many`
-fits clips × experiments × seeds in other processes: `fit_many`. `animations` runs finished
-systems: `solve`, `apply`, `compare` and `run_suite`. `views` shows runs, clips and fits in the
-browser: `view`, `view_run`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes
-parameters for others: `export`. `examples` copies the experiments that come with the package.
+Each job stands with its study in `fitting.studies`; `view` and `view_run` stand in
+`fitting.viewer`.
 """
 
 from .studies.ablation import ablate as ablate
