@@ -120,6 +120,13 @@ def test_a_search_that_runs_out_of_steps_is_recalled_as_such(path):
     assert_same(solve(path, few), first)
 
 
+def test_only_searches_inside_the_checkpoints_use_them(path):
+    with pytest.raises(RuntimeError, match="a kill"), checkpoints_in(path):
+        stop()
+    assert_same(search.find_best_fit(problem(), SHORT, starts=2), whole(SHORT))
+    assert not path.exists()
+
+
 def test_time_adds_up_over_the_calls_and_another_search_does_not_use_the_stages(path):
     solve(path, SHORT)
     change_file(path, lambda content: stages_in(content)[-1]["history"][-1].update(seconds=500.0))

@@ -321,8 +321,7 @@ def open_checkpoints(
     run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
 ) -> Checkpoints:
     """The finished stages of a fit that was killed in this folder, and room for those of this."""
-    identity = search_identity(problem, experiment)
-    checkpoints = Checkpoints(run, run_folder.SEARCH, identity, log)
+    checkpoints = Checkpoints(run, run_folder.SEARCH, search_identity(problem, experiment), log)
     if checkpoints.count:
         stages = f"{checkpoints.count} stages of its search"
         if checkpoints.profile_count:
