@@ -34,7 +34,7 @@ from fitting.inference.profiles import profiling
 from fitting.inference.sample import posterior
 from fitting.inference.sample.posterior import Posterior
 from fitting.motion import playback
-from fitting.report import pages
+from fitting.report import document, pages
 from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
 from fitting.studies.fit import assess, fit_jobs, fit_report, identifiability_report, run_folder
@@ -67,7 +67,7 @@ FIT_WORK = [
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
     ("Measuring where limits are in effect", (fit_report.playback, "measure"), PLAY),
     ("Finding what determines 2 parameters", (identifiability_report, "find_evidence"), PLAY),
-    ("Writing the page", (fit_report.fit_page, "write")),
+    ("Writing the page", (document.Document, "write")),
     ("Finishing the pictures",),
 ]
 SAMPLE_WORK = [

@@ -64,13 +64,46 @@ class Grid(NamedTuple):
     """Whether a terminal shows it."""
 
 
+@dataclass(frozen=True)
+class ParameterRow:
+    """A parameter as the page shows it; fractions say how far up its range, on its scale."""
+
+    name: str
+    meaning: str
+    value: str
+    unit: str
+    interval: str
+    range: str
+    verdict: str
+    determined: bool
+    at: float
+    low: float
+    high: float
+    before: float | None
+    truth: float | None
+    description: str
+    """Of the interval plot, for those who do not see it."""
+
+
+class Ranges(NamedTuple):
+    """Parameters within their ranges, which the page draws; elsewhere a table says it."""
+
+    rows: Sequence[ParameterRow]
+    label: str
+    """For those who do not see it."""
+    note: str
+    """What the page draws."""
+    table: Table
+
+
 class Plot(NamedTuple):
-    """A figure, drawn into a file beside the document; no terminal shows it."""
+    """A figure in a file beside the document; no terminal shows it."""
 
     name: str
     """Of the file."""
     caption: str
-    draw: Callable[[], Figure]
+    draw: Callable[[], Figure] | None = None
+    """None for one that is drawn already."""
 
 
 class Jump(NamedTuple):
@@ -79,11 +112,11 @@ class Jump(NamedTuple):
     words: str
     clip: int
     """Its number among the clips of the view, from 0."""
-    key: str
-    """Of the motion."""
+    key: str = ""
+    """Of the motion; the one that is watched at first if there is none."""
 
 
-Block: TypeAlias = Text | Heading | Points | Terms | Grid | Plot | Jump
+Block: TypeAlias = Text | Heading | Points | Terms | Grid | Ranges | Plot | Jump
 
 
 class Finding(NamedTuple):
@@ -112,6 +145,10 @@ class View:
     """Of the clips."""
     visible: str
     """From which depth on a sole in the ground is marked, with its unit."""
+    stands: str = "animated"
+    """Whose feet are said to stand."""
+    watched: str = "watched motion"
+    """Whose soles are marked."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +174,8 @@ class Document:
     files: Mapping[str, str] = field(default_factory=dict)
     """What is in which other file beside it, by file name; `write` does not write these."""
     view: View | None = None
+    note: str = ""
+    """What else there is to say of the findings."""
 
     @property
     def sentences(self) -> list[str]:
@@ -144,14 +183,9 @@ class Document:
         return [finding.text for finding in sorted(self.findings, key=lambda f: not f.bad)]
 
     @property
-    def plots(self) -> list[Plot]:
-        """The plots of all sections."""
-        return _plots(self.sections)
-
-    @property
     def beside(self) -> dict[str, str]:
         """What is in which file, by file name."""
-        plots = {plot.name: "a figure" for plot in self.plots}
+        plots = {plot.name: "a figure" for plot in _plots(self.sections) if plot.draw}
         numbers = dict.fromkeys(self.numbers, "all numbers")
         return {self.file: "the text", **numbers, **self.files, **plots}
 
@@ -163,8 +197,7 @@ class Document:
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in self.numbers.items():
             write_json(folder / path, content)
-        for plot in self.plots:
-            style.save(folder / plot.name, plot.draw())
+        _draw(folder, self.sections)
         files.write_text(folder / self.file, _whole(self))
         pictures = _pictures(folder, self.sections)
         spent = sum(picture.size for picture in pictures.values())
@@ -185,8 +218,7 @@ def add(folder: Path, file: str, title: str, sections: Sequence[Section]) -> Non
         sections: the headings of those added before begin with the same one.
     """
     page, path = folder / pages.PAGE, folder / file
-    for plot in _plots(sections):
-        style.save(folder / plot.name, plot.draw())
+    _draw(folder, sections)
     if page.is_file():
         text = page.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
         before, start, rest = text.partition(START)
@@ -221,6 +253,12 @@ def _plots(sections: Sequence[Section]) -> list[Plot]:
     return [block for block in blocks_of(sections) if isinstance(block, Plot)]
 
 
+def _draw(folder: Path, sections: Sequence[Section]) -> None:
+    for plot in _plots(sections):
+        if plot.draw is not None:
+            style.save(folder / plot.name, plot.draw())
+
+
 def _pictures(folder: Path, sections: Sequence[Section]) -> dict[str, pages.Picture]:
     """Of the plots that the page shows, by file name."""
     plots = _plots(_on_page(sections))
@@ -235,14 +273,16 @@ def _says_something(block: Block) -> bool:
             return bool(lines)
         case Grid(rows=rows):
             return len(rows) > 1
+        case Ranges(rows=rows):
+            return bool(rows)
         case _:
             return True
 
 
 def text(document: Document) -> JoinedText:
     """The document in brief, for a terminal: verdict, findings, tables."""
-    parts = [f"{document.verdict}.", bullets(document.sentences), brief(document.sections)]
-    return joined(parts, apart=True)
+    parts = [f"{document.verdict}.", bullets(document.sentences), document.note]
+    return joined([*filter(None, parts), brief(document.sections)], apart=True)
 
 
 def brief(sections: Sequence[Section]) -> JoinedText:
@@ -256,7 +296,7 @@ def brief(sections: Sequence[Section]) -> JoinedText:
                 parts.append(f"{words}:")
             case Points(lines=lines, brief=True):
                 parts.append(bullets(lines))
-            case Grid(rows=rows, brief=True):
+            case Grid(rows=rows, brief=True) | Ranges(table=rows):
                 parts.append(aligned(rows))
             case _:
                 pass
@@ -271,6 +311,7 @@ def _whole(document: Document) -> str:
         f"# {document.title}",
         f"{document.kind}: **{document.verdict}**.",
         bullets(document.sentences),
+        *filter(None, [document.note]),
         *markdown(sections),
         f"More in this folder: {', '.join(islice(others, 1, None))}.",
     ]
@@ -291,9 +332,8 @@ def markdown(sections: Sequence[Section]) -> Iterator[str]:
                     yield bullets(block.lines)
                 case Terms():
                     yield bullets([f"**{name}**: {words}" for name, words in block.rows])
-                case Grid():
-                    rows = [[_red(cell) for cell in row] for row in block.rows]
-                    yield formatting.markdown(rows)
+                case Grid(rows=rows) | Ranges(table=rows):
+                    yield formatting.markdown([[_red(cell) for cell in row] for row in rows])
                 case Plot():
                     yield f"![{block.caption}]({block.name})"
                 case Jump():

@@ -144,7 +144,7 @@ def document_html(document: Document) -> str:
     for block in blocks_of(document.sections):
         if isinstance(block, Grid) and block.brief:
             shown.append(table(block.rows))
-        elif isinstance(block, Plot):
+        elif isinstance(block, Plot) and block.draw is not None:
             shown.append(picture(block.draw(), block.caption))
     lines = [f"{document.verdict}.", *document.sentences]
     return page(f"{document.kind}: {document.title}", sentences(lines), *shown)

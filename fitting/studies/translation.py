@@ -39,16 +39,8 @@ from fitting.motion.accuracy import NEGLIGIBLE, Difference, Remainder, summarise
 from fitting.problem.problem import Problem
 from fitting.problem.space import free_parameter
 from fitting.report import style
-from fitting.report.formatting import (
-    DIFFERENCES,
-    Table,
-    aligned,
-    bullets,
-    joined,
-    markdown,
-    number,
-    percent,
-)
+from fitting.report.document import Block, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import DIFFERENCES, Table, number, percent
 from fitting.report.style import AFTER, BEFORE, EARTH, legend, styled
 from fitting.runtime import activity, files, validation
 from fitting.runtime.json_files import write_json
@@ -330,17 +322,6 @@ def differences(fitted: Fit) -> list[Difference]:
     ]
 
 
-def translation_text(translation: Translation, clips: Sequence[Difference]) -> str:
-    """The result of a translation, for the terminal."""
-    source, target = translation.source.name, translation.target.name
-    phases = accuracy.summarise_differences(clips)
-    parts = [headline(phases["all frames"], source, target)]
-    for phase, remainders in phases.items():
-        parts += ["", f"{phase.capitalize()}:"]
-        parts.append(aligned(table(remainders, source)))
-    return joined([*parts, "", *shortcomings(clips, source, target)])
-
-
 @in_float64
 def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> None:
     """Writes parameters, numbers, plots and summary of a translation into the folder of its run."""
@@ -355,57 +336,64 @@ def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Diff
     write_json(run / NUMBERS, content)
     parameters = parameter_files.system_to_toml(fitted.ik, target.preset)
     files.write_text(run / f"{target.preset.name}.toml", parameters)
-    opening = [*_opening(translation, fitted, clips), _plots(run, translation, clips)]
-    fit_report.write_fit(run, fitted, opening, _parameters_of_both(translation, fitted))
+    first, second = source.name, target.name
+    for plot, clip in zip(_plots(translation, len(clips)), clips, strict=True):
+        style.save(run / plot.name, difference(clip, first, second, plot.caption))
+    sections = [opening(translation, fitted, clips)], [_parameters_of_both(translation, fitted)]
+    fit_report.write_fit(run, fitted, *sections)
 
 
-def _plots(run: Path, translation: Translation, clips: Sequence[Difference]) -> str:
-    """Draws what remains of each clip; returns the plots as Markdown."""
-    source, target = translation.source.name, translation.target.name
-    lines = []
-    for number_of_clip, clip in enumerate(clips, 1):
-        several = len(clips) > 1
-        name = f"difference_{number_of_clip}.png" if several else "difference.png"
-        subject = f", clip {number_of_clip}" if several else ""
-        title = f"{translation.experiment.name}{subject}: what remains"
-        style.save(run / name, difference(clip, source, target, title))
-        lines.append(f"![{title}]({name})")
-    return "\n\n".join(lines)
+def _plots(translation: Translation, count: int) -> list[Plot]:
+    """What remains of each clip, for so many of them."""
+    name = translation.experiment.name
+    if count == 1:
+        return [Plot("difference.png", f"{name}: what remains")]
+    return [
+        Plot(f"difference_{number}.png", f"{name}, clip {number}: what remains")
+        for number in range(1, count + 1)
+    ]
 
 
-def _opening(translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> list[str]:
-    """The first section of the summary: how close the fit is, and what it cannot do."""
+def opening(translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> Section:
+    """How close the fit is, and what it cannot do; the plots are drawn by `write`."""
     source, target = translation.names
     phases = accuracy.summarise_differences(clips)
-    parts = [
-        f"## How much of {source} {target} reproduces",
-        headline(phases["all frames"], source, target),
-        "Reproduced is 1 - rms(what remains) / rms(source - animation): 100 % is the same motion, "
-        "0 % is no better than the animation, and negative is worse; – where the source corrects "
-        "nothing.",
+    blocks: list[Block] = [
+        Text(headline(phases["all frames"], source, target), brief=True),
+        Text(
+            "Reproduced is 1 - rms(what remains) / rms(source - animation): 100 % is the same "
+            "motion, 0 % is no better than the animation, and negative is worse; – where the "
+            "source corrects nothing."
+        ),
     ]
     for phase, remainders in phases.items():
-        rows = table(remainders, source)
-        parts += [f"{phase.capitalize()}:", markdown(rows)]
+        blocks.append(Text(f"{phase.capitalize()}:", brief=True))
+        blocks.append(Grid(table(remainders, source), f"What remains, {phase}"))
     if remarks := shortcomings(clips, source, target):
-        parts += [f"What {target} does not do as {source} does:", bullets(remarks)]
+        blocks.append(Text(f"What {target} does not do as {source} does:"))
+        blocks.append(Points(remarks, brief=True))
     ends = zip(fitted.identifiability.names, fitted.identifiability.at_bound, strict=True)
     if at_bound := [f"`{name}`" for name, end in ends if end]:
-        parts.append(f"At an end of their range, which may be too narrow: {', '.join(at_bound)}.")
+        names = ", ".join(at_bound)
+        blocks.append(Text(f"At an end of their range, which may be too narrow: {names}."))
     free = translation.experiment.free
     fixed = [f"`{n}`" for n in sensitivity.all_parameters(translation.target.ik) if n not in free]
     reason = (
         "as requested" if translation.free_was_chosen else "as they move nothing in these clips"
     )
-    parts.append(
-        f"Parameters of {target} that kept their values, {reason}: {', '.join(fixed) or 'none'}. "
-        "The source has no noise; the sigmas of the fit (5 mm, 0.03 rad) say how far apart still "
-        "counts as the same, and so decide what is called determined below."
+    blocks.append(
+        Text(
+            f"Parameters of {target} that kept their values, {reason}: "
+            f"{', '.join(fixed) or 'none'}. The source has no noise; the sigmas of the fit (5 mm, "
+            "0.03 rad) say how far apart still counts as the same, and so decide what is called "
+            "determined below."
+        )
     )
-    return parts
+    blocks += _plots(translation, len(clips))
+    return Section(f"How much of {source} {target} reproduces", blocks)
 
 
-def _parameters_of_both(translation: Translation, fitted: Fit) -> list[str]:
+def _parameters_of_both(translation: Translation, fitted: Fit) -> Section:
     """The section with the values of both systems side by side."""
     source, target = translation.names
     iks = translation.source.ik, fitted.ik
@@ -424,7 +412,8 @@ def _parameters_of_both(translation: Translation, fitted: Fit) -> list[str]:
         remarks = ["fitted"] if name in free_leaves else []
         remarks += ["of another rule"] if "–" not in values and len(rules) > 1 else []
         table.append([f"`{name}`", units[0] if units else "", *values, ", ".join(remarks)])
-    return ["## Parameters of both systems", markdown(table)]
+    grid = Grid(table, "Parameters of both systems", brief=False)
+    return Section("Parameters of both systems", [grid])
 
 
 def _value_text(value: Array) -> str:

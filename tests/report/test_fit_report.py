@@ -31,7 +31,8 @@ from fitting.motion import goodness, playback
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.space import ParameterPrior, Priors, Space, make_space
-from fitting.report import document
+from fitting.report import document, pages
+from fitting.report.document import Grid, Section, Text
 from fitting.report.formatting import markdown
 from fitting.runtime import display
 from fitting.studies.fit import fit_report, goodness_report, run_folder
@@ -138,7 +139,8 @@ def test_known_values_are_those_of_the_first_clip_that_has_any(experiment, tmp_p
 
 def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted, experiment):
     text = fit_report.fit_text(fitted)
-    assert text.startswith(fitted.verdict.sentence) and "\nNot converged: the 8 steps" in text
+    assert text.startswith("Not converged.\n") and fitted.verdict.sentence in text
+    assert "Not converged: the 8 steps" in text
     assert "Cost 900 before, 100 after: 8 steps" in text
     distance = goodness.size("ankle", fitted.distances.parts["fitted"]["fitted"]["ankle"])
     assert re.split(r"\s{2,}", line_of(text, "ankles  "))[1::3] == ["fitted", distance]
@@ -149,13 +151,14 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     soften = line_of(text, "leg.soften")
     assert "at least 0.85" in soften and "at its upper bound" in soften
     assert "unknown" in soften
-    assert text.endswith("1 of 2 determined parameters within 5 % of their range")
+    assert "\n1 of 2 determined parameters within 5 % of their range.\n" in text
     whitened = replace(experiment, noise=NoiseOptions(correlation="whitened"))
     text = fit_report.fit_text(replace(fitted, known_values=None, experiment=whitened))
     assert "100 after (both with the noise estimated here)" in text
     assert "truth" not in text and "determined parameters within" not in text
     # A gain is shown as half-life, s, and at 30 and 60 Hz.
-    name, half_life, *_, gain, gain_at_60 = text.split("gain at 60 Hz")[1].split()[-5:]
+    gains = line_of(text.split("gain at 60 Hz")[1], "pelvis.on_gain")
+    name, half_life, _, gain, gain_at_60 = gains.split()
     assert name == "pelvis.on_gain"
     shown = [float(number) for number in (half_life, gain, gain_at_60)]
     expected = [np.log(0.5) / np.log(0.7) / 30.0, 0.3, 1 - np.sqrt(0.7)]
@@ -172,14 +175,15 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert centre is not None and centre == pytest.approx(planted["before"])
     u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
     np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
-    text = "\n".join(prior_report.prior_section(rows))
+    text = "\n".join(document.markdown([prior_report.prior_section(rows)]))
     low, high = planted["prior"]["interval"]
     assert line_of(text, "contact.planted_height") == (
         f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
         "| 0.1 to 0.12 |"
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
-    text = "\n".join(prior_report.prior_section(fitted.summary["parameters"]))
+    section = prior_report.prior_section(fitted.summary["parameters"])
+    text = "\n".join(document.markdown([section]))
     assert "| normal | 0.9667 (system: 1) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
@@ -192,20 +196,21 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
         path.write_bytes(b"")
 
     monkeypatch.setattr(Figure, "savefig", savefig)
-    fit_report.write_fit(tmp_path, fitted, ["before its goodness"], ["before its pictures"])
+    opening, details = (Section(name, [Text("Text.")]) for name in ("Opening", "Details"))
+    fit_report.write_fit(tmp_path, fitted, [opening], [details])
     text = (tmp_path / run_folder.SUMMARY).read_text()
-    for following in ("goodness\n\n## Goodness of fit\n", "pictures\n\n## Pictures\n"):
-        assert f"\nbefore its {following}" in text
+    for name, following in (("Opening", "Goodness of fit"), ("Details", "Pictures")):
+        assert f"\n## {name}\n\nText.\n\n## {following}\n" in text
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {*CLIP_PLOTS, "cost", "worst", "profiles"}
     assert set(names) == {f"{plot}.png" for plot in plots}
-    assert {path.name for path in tmp_path.iterdir()} == {*names, run_folder.SUMMARY}
+    assert {path.name for path in tmp_path.iterdir()} == {*names, run_folder.SUMMARY, pages.PAGE}
     assert len(sizes) == len(plots)
     assert all(1000 < width < 2000 and 400 < height < 2500 for width, height in sizes)
     assert "| contact.planted_height | 0.11 | m |" in text
     assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Not determined: `leg.soften`." in text
-    assert f"**{fitted.verdict.sentence}**" in text.split("## Goodness of fit")[1]
+    assert fitted.verdict.sentence in text.split("## Opening")[0]
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | at least 0.85 | 0.85 to 1 | 0.100 |" in text
     nudges = playback.nudge_thresholds(fitted.problem, fitted.solution.u)
@@ -235,19 +240,18 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     assert set(by_kind) == set(playback.RESIDUAL_KINDS)
     assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
     # What a translation leaves is measured in tolerances.
-    (_, sentence, _, *texts) = goodness_report.goodness_section(replace(fitted, has_noise=False))
-    assert sentence.startswith(("**Not the same motion: ", "**The same motion"))
-    assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
+    of_source = replace(fitted, has_noise=False)
+    assert of_source.verdict.sentence.startswith(("Not the same motion: ", "The same motion"))
+    *_, tolerances = goodness_report.goodness_blocks(of_source)
+    assert isinstance(tolerances, Grid) and "error, rms" in tolerances.rows[0]
 
 
 def test_the_second_of_two_clips_has_its_own_plots(fitted, twice, tmp_path, undrawn):
     (after,) = fitted.playbacks
     plots = fit_report._draw_clip(tmp_path, twice, 1, after, after)
-    assert set(plots) == {f"{name}_2.png" for name in CLIP_PLOTS}
+    assert set(plots) == {f"{name}_2.png" for name in (*CLIP_PLOTS, "worst")}
     assert all(caption.startswith("hill, clip 2: ") for caption in plots.values())
-    for number in (1, 2):
-        _, plot = fit_report._worst_window(tmp_path, twice, number - 1, after)
-        assert plot == f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)"
+    assert plots["worst_2.png"] == "hill, clip 2: the worst 1.9 seconds"
 
 
 def test_a_playback_has_the_residuals_of_the_fit_and_rebuilds_captured_joints(fitted):
@@ -583,13 +587,13 @@ def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):
 def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_system(fitted):
     shown = replace(fitted)
     rows = fitted.summary["parameters"]
-    of_capture = {**rows[1], "name": "capture.ground_height", "unit": "m", "of": "capture"}
-    vars(shown)["summary"] = {**fitted.summary, "parameters": [*rows, of_capture]}
+    of_capture = {**rows[0], "of": "capture"}
+    vars(shown)["summary"] = {**fitted.summary, "parameters": [*rows[1:], of_capture]}
     seen = GroundOffset(-0.029, 0.004, 14, tilt_z=math.radians(1.2))
     vars(shown)["capture_signs"] = [CaptureSigns(seen, -0.031)]
     text = fit_report.fit_text(shown)
-    system, _, capture = text.partition("The capture:")
-    assert "capture.ground_height" in capture and "capture.ground_height" not in system
+    system, _, capture = text.partition("What is not known of the captures")
+    assert "contact.planted_height" in capture and "contact.planted_height" not in system
     sentences = goodness_report.sentences(shown)
     assert [line in text for line in sentences] == [True] * 3
     assert sentences[0] == (
@@ -598,13 +602,11 @@ def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_sys
     )
     assert "1.2° along z: a tilted floor? `[capture] ground_tilt_z = {}`" in sentences[1]
     assert "31 ms before the fitted ones: a time shift? `[capture] time_shift" in sentences[2]
-    section = "\n".join(goodness_report.capture_section(shown, None))
-    assert section.startswith("## The capture") and "capture.ground_height" in section
+    section = "\n".join(document.markdown([fit_report._capture(shown)]))
+    assert section.startswith("## The capture") and "contact.planted_height" in section
     freed = replace(shown, experiment=replace(shown.experiment, capture={"time_shift": {}}))
     vars(freed)["capture_signs"] = vars(shown)["capture_signs"]
     assert len(goodness_report.sentences(freed)) == 2  # what is fitted needs no remedy
     vars(freed)["capture_signs"] = [CaptureSigns(GroundOffset(0.0, 0.01, 14), 0.0)] * 2
-    assert (
-        goodness_report.sentences(freed) == []
-        and goodness_report.capture_section(fitted, None) == []
-    )
+    assert goodness_report.sentences(freed) == []
+    assert list(document.markdown([fit_report._capture(fitted)])) == []

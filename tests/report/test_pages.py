@@ -25,7 +25,13 @@ from fitting.report import document, formatting, motion_data, pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.style import save
 from fitting.studies import animations, comparison, comparison_report
-from fitting.studies.fit import fit_motions, fit_page, fit_plots, identifiability_report, sentences
+from fitting.studies.fit import (
+    fit_motions,
+    fit_plots,
+    fit_report,
+    identifiability_report,
+    sentences,
+)
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
@@ -302,7 +308,7 @@ def test_the_page_says_what_was_found(page, fitted):
 
 def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, monkeypatch):
     monkeypatch.setattr(Fit, "playbacks", (playback(sigmas={"contact": 0.25}), playback()))
-    asked = dict(fit_page._asked(dataclasses.replace(fitted)))
+    asked = dict(fit_report._asked(dataclasses.replace(fitted)))
     assert asked["Noise, m and rad"] == "ankle 0.02, knee 0.03, pelvis 0.02, contact 0.25"
 
 
@@ -364,7 +370,7 @@ def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
 
 def test_a_long_clip_has_fewer_frames_and_many_grounds_are_coarser(fitted, motions, monkeypatch):
     (play,) = fitted.playbacks
-    shown = fit_page.shown(motions, "captured", worst_window.find_worst_window(play))
+    shown = fit_report.shown(motions, "captured", worst_window.find_worst_window(play))
     (whole,) = motion_data.pack([shown])
     assert motion_data.steps_between_frames([shown]) == [1]  # 30 Hz
     assert motion_data.steps_between_frames([shown], -1) == [8]  # one frame of seven is left

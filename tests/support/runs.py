@@ -12,9 +12,9 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimise.solution import Progress, Solution
 from fitting.motion import playback
 from fitting.motion.playback import ClipActivity
-from fitting.studies.fit import fit_page, run_folder
+from fitting.studies.fit import fit_report, run_folder
 from fitting.studies.fit.fit import Fit
-from fitting.studies.fit.fit_page import Measured
+from fitting.studies.fit.fit_report import Measured
 
 from .experiments import CLIP, write
 from .profiles import parabolas
@@ -72,7 +72,7 @@ def write_run(run: Path, fitted: Fit) -> None:
     counts = (scene.rig.names, scene.frames.dt.size, 0.2)
     activity = ClipActivity(*counts, foot, foot, foot, foot, (1, 2), (1, 1), LIMITS)
     before = playback.run(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
-    fit_page.write(run, fitted, Measured([before], [activity]))
+    fit_report.fit_document(fitted, Measured([before], [activity], {})).write(run)
 
 
 def save(run: Path, fitted: Fit) -> None:

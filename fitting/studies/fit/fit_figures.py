@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 
 from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import Placement
 from fitting.motion.playback import ClipActivity
+from fitting.report.document import ParameterRow
 from fitting.report.formatting import ACCURACY, Table, headings, interval, number
 from fitting.studies import animations
 
@@ -15,27 +16,6 @@ from .fit import FittedParameter
 from .fit_tables import Truth, verdict
 
 NO_CORRECTION = ("bone_length",)  # figures that say nothing of how close two motions are
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """A parameter as the page shows it; fractions say how far up its range, on its scale."""
-
-    name: str
-    meaning: str
-    value: str
-    unit: str
-    interval: str
-    range: str
-    verdict: str
-    determined: bool
-    at: float
-    low: float
-    high: float
-    before: float | None
-    truth: float | None
-    description: str
-    """Of the interval plot, for those who do not see it."""
 
 
 def parameter_rows(

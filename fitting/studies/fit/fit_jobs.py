@@ -19,6 +19,7 @@ from fitting.inference.optimise.solution import Progress, Solution
 from fitting.inference.sample.posterior import Posterior, SamplingProgress
 from fitting.problem.problem import Problem
 from fitting.report import style
+from fitting.report.document import Section, brief
 from fitting.report.formatting import joined
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
@@ -105,12 +106,12 @@ def fit(
             if run is not None and report:
                 style.prepare_saving()
             fitted = _assess_and_save(run, experiment, problem, solution, shown, progress)
-        texts, sections = _price_of_record(fitted, progress, log)
+        opening = _price_of_record(fitted, progress, log)
         if run is not None and report:
-            fit_report.write_fit(run, fitted, sections, rehearsal=rehearsal)
+            fit_report.write_fit(run, fitted, opening, rehearsal=rehearsal)
         if not fitted.solution.interrupted:
             checkpoints.remove()
-        log(joined(["", fit_report.fit_text(fitted), *texts]))
+        log(joined(["", fit_report.fit_text(fitted, opening)]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
@@ -225,26 +226,25 @@ def translate(
         if not fitted.solution.interrupted:
             checkpoints.remove()
         log(f"\n{solution.message} {fitted.verdict.sentence}\n")
-        log(translation.translation_text(prepared, differences))
+        log(brief([translation.opening(prepared, fitted, differences)]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
 
 def _price_of_record(
     fitted: Fit, progress: Callable[[Progress], None] | None, log: Log
-) -> tuple[list[str], list[str]]:
-    """What it costs to fit only what the record holds: for the terminal, and in Markdown."""
+) -> list[Section]:
+    """What it costs to fit only what the record holds."""
     experiment = fitted.experiment
     if not (experiment.record_only and experiment.free):
-        return [], []
+        return []
     if (names := left_out(experiment)) and not fitted.solution.interrupted:
         log(f"what the record costs: a search in which {', '.join(names)} are free, too")
     try:
         price = record_price.measure(fitted, progress)
     except KeyboardInterrupt:  # the fit is finished: its report must be written
         price = None
-    text = record_price.text(experiment, price)
-    return ["", text], record_price.section(experiment, price)
+    return [record_price.section(experiment, price)]
 
 
 def _save_and_report(run: Path, sampled: SampledFit) -> None:

@@ -1,61 +1,87 @@
-"""The report of a fit: text for the terminal, the run's summary.md with its plots, its page."""
+"""The report of a fit: what it found, with its plots and its motions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
 
+import jaxik
+from fitting.clips import flight
 from fitting.motion import playback, worst_window
-from fitting.motion.playback import ClipActivity, Playback
-from fitting.report import style
-from fitting.report.formatting import aligned, bullets, joined, markdown
-from fitting.runtime import activity, files
+from fitting.motion.measures import Placement
+from fitting.motion.playback import ClipActivity, Nudge, Playback
+from fitting.motion.worst_window import WorstWindow
+from fitting.report import document, motion_data, pages, style
+from fitting.report.document import (
+    Block,
+    Document,
+    Finding,
+    Grid,
+    Heading,
+    Jump,
+    Plot,
+    Points,
+    Ranges,
+    Section,
+    Terms,
+    Text,
+    View,
+)
+from fitting.report.formatting import Table
+from fitting.report.motion_data import ShownClip, ShownMotion
+from fitting.runtime import activity
 from fitting.runtime.beside import calls_beside
 from fitting.runtime.precision import in_float64
 from fitting.studies.sample import prior_report
+from jaxik.maths import parameter_tree
 
-from . import fit_page, fit_plots, fit_tables, goodness_report, identifiability_report
+from . import (
+    fit_figures,
+    fit_motions,
+    fit_plots,
+    fit_tables,
+    goodness_report,
+    identifiability_report,
+    sentences,
+)
 from .assess import MIN_IMPROVEMENT
-from .fit import Fit
-from .fit_motions import Rehearsal
-from .fit_page import Measured
-from .identifiability_report import sections as identifiability_sections
-from .run_folder import SUMMARY
+from .fit import Fit, FittedParameter
+from .fit_motions import ClipMotions, Rehearsal
+from .run_folder import FIT, PARAMETERS, SUMMARY
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
+RANGES = (
+    "Dot: fitted value. Band: its 95 % interval, blue where the clips determine the parameter and "
+    "dashed grey where they do not. Grey tick: before the fit. Green line: the true value, where "
+    "it is known."
+)
 Plots: TypeAlias = dict[str, str]  # captions by file name
 
 
-def fit_text(fitted: Fit) -> str:
-    """The result of a fit, for the terminal."""
-    rows, truth = fitted.summary["parameters"], fitted.known_values
-    parts = [goodness_report.text(fitted), ""]
-    if not rows:
-        return joined([*parts, fitted.summary["message"]])
-    parts += [fitted.summary["message"], cost_sentence(fitted), ""]
-    system, capture = goodness_report.of_system(rows), goodness_report.of_capture(rows)
-    parts.append(aligned(fit_tables.parameter_table(system, truth)))
-    if capture:
-        parts += ["", f"{goodness_report.HEADING}:"]
-        parts.append(aligned(fit_tables.parameter_table(capture, truth)))
-    if seen := goodness_report.sentences(fitted):
-        parts += ["", *seen]
-    if any("half_life" in row for row in rows):
-        parts += ["", aligned(fit_tables.gain_table(rows))]
-    if truth:
-        parts += ["", fit_tables.recovered(rows, truth)]
-    return joined(parts)
+class Measured(NamedTuple):
+    """What takes long to measure, for each clip."""
+
+    before: Sequence[jaxik.Result]
+    """Of the system as it was before the fit."""
+    activities: Sequence[ClipActivity]
+    nudges: Mapping[str, tuple[Nudge, Nudge]]
+    """By threshold."""
+
+
+def fit_text(fitted: Fit, opening: Sequence[Section] = ()) -> str:
+    """The result of a fit, for the terminal; the `opening` comes before its numbers."""
+    return document.text(fit_document(fitted, opening=opening))
 
 
 @in_float64
 def write_fit(
     run: Path,
     fitted: Fit,
-    opening: Sequence[str] = (),
-    details: Sequence[str] = (),
+    opening: Sequence[Section] = (),
+    details: Sequence[Section] = (),
     rehearsal: Rehearsal | None = None,
 ) -> None:
     """Writes the plots of a fit, a new summary.md and its page into the folder of its run.
@@ -63,12 +89,11 @@ def write_fit(
     Args:
         run: the folder.
         fitted: the fit.
-        opening: paragraphs of Markdown to insert before the parameters.
-        details: paragraphs of Markdown to insert before the plots.
+        opening: sections to insert before the goodness of the fit.
+        details: sections to insert before the pictures.
         rehearsal: of the fit's problem, if one has begun.
     """
     plots: Plots = {}
-    worst = ["## The worst two seconds"]
     with activity.announced("Playing the clips with the system before the fit"):
         before = (rehearsal or Rehearsal(fitted.problem)).results()
     with ExitStack() as drawing, calls_beside():
@@ -79,39 +104,90 @@ def write_fit(
             with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
                 first = playback.play(scene, before[index])
                 plots |= _draw_clip(run, fitted, index, first, after)
-                worst += _worst_window(run, fitted, index, after)
-        plots |= curves
         with activity.announced("Measuring where limits are in effect"):
-            clips = playback.measure(fitted.ik, fitted.scenes, fitted.results)
-            limits = _limits(fitted, clips)
-        parts = [
-            *_result(fitted),
-            *_check(fitted),
-            *opening,
-            *goodness_report.goodness_section(fitted),
-            *(_parameters(fitted, clips) if fitted.experiment.free_count else []),
-            *limits,
-            *worst,
-            *details,
-            "## Pictures",
-            gallery(plots),
-        ]
-        if fitted.clips:
-            with activity.announced("Writing the page"):
-                fit_page.write(run, fitted, Measured(before, clips))
+            measured = Measured(
+                before,
+                playback.measure(fitted.ik, fitted.scenes, fitted.results),
+                playback.nudge_thresholds(fitted.problem, fitted.solution.u),
+            )
+        pictures = [Plot(name, caption) for name, caption in (plots | curves).items()]
+        details = [*details, Section("Pictures", pictures, on_page=False)]
+        report = fit_document(fitted, measured, opening, details)
+        with activity.announced("Writing the page"):
+            report.write(run)
         drawing.enter_context(activity.announced("Finishing the pictures"))
-    files.write_text(run / SUMMARY, "\n\n".join(parts) + "\n")
+
+
+@in_float64
+def fit_document(
+    fitted: Fit,
+    measured: Measured | None = None,
+    opening: Sequence[Section] = (),
+    details: Sequence[Section] = (),
+) -> Document:
+    """What a fit says; without what is measured only as much as the terminal shows."""
+    summary, motions = fitted.summary, []
+    if measured is not None:
+        every = zip(fitted.clips, measured.before, fitted.results, strict=False)
+        motions = [fit_motions.clip_motions(*results) for results in every]
+    sections = [
+        Section("What these clips can tell", [Points(fitted.check.lines)]),
+        *opening,
+        Section("Goodness of fit", goodness_report.goodness_blocks(fitted), on_page=False),
+        _parameters(fitted),
+        _capture(fitted),
+        _distances(fitted, motions),
+    ]
+    if measured is not None:
+        sections += [_worst(fitted), *_determined(fitted, measured.activities)]
+        sections += [_activity(measured), _limits(fitted, measured.activities)]
+    return Document(
+        file=SUMMARY,
+        kind="Foot IK fitted to captured motion",
+        title=fitted.experiment.name,
+        verdict=sentences.verdict_word(fitted),
+        good=summary["converged"] and fitted.verdict.fits,
+        findings=[Finding(sentence) for sentence in sentences.findings(fitted, motions)],
+        sections=[*sections, *details],
+        asked=_asked(fitted),
+        files={FIT: "all numbers", PARAMETERS: "the fitted system"},
+        view=_view(fitted, motions) if motions else None,
+        note=f"{fitted.verdict.sentence} {summary['message']} {cost_sentence(fitted)}",
+    )
+
+
+def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
+    windows = map(worst_window.find_worst_window, fitted.playbacks)
+    labels = [scene.reference.label for scene in fitted.problem.data]
+    return View(
+        [shown(*each) for each in zip(motions, labels, windows, strict=True)],
+        [entry.reference.name for entry in fitted.experiment.clips],
+        f"{100 * motions[0].fitted.placement.visible:.2g} cm",
+        stands="captured",
+        watched="fitted motion",
+    )
+
+
+def shown(clip: ClipMotions, label: str, window: WorstWindow) -> ShownClip:
+    """What the page shows of one clip; `label` is what it calls the captured motion."""
+    worst = window.start, window.end
+    return ShownClip(
+        {
+            "animated": ShownMotion("flat animation", clip.animated, motion_data.ANIMATED),
+            "before": ShownMotion("before the fit", clip.before, motion_data.BEFORE),
+            "captured": ShownMotion(label, clip.captured, motion_data.CAPTURED, visible=True),
+            "fitted": ShownMotion("fitted", clip.fitted, motion_data.FITTED, True, worst),
+        },
+        clip.stance,
+        clip.ground,
+        watched="fitted",
+    )
 
 
 def save_plot(run: Path, name: str, caption: str, figure: Figure) -> Plots:
     """Saves a figure; returns its file name with the caption."""
     style.save(run / name, figure)
     return {name: caption}
-
-
-def gallery(plots: Plots) -> str:
-    """Plots as Markdown."""
-    return "\n\n".join(f"![{caption}]({name})" for name, caption in plots.items())
 
 
 def cost_sentence(fitted: Fit) -> str:
@@ -137,17 +213,6 @@ def _clip_names(fitted: Fit, index: int) -> tuple[str, str]:
     return title, f"_{index + 1}.png" if several else ".png"
 
 
-def _worst_window(run: Path, fitted: Fit, index: int, play: Playback) -> list[str]:
-    """Draws and describes the worst two seconds of a clip."""
-    legs = fitted.problem.data[index].rig.names
-    window = worst_window.find_worst_window(play)
-    clip, ending = _clip_names(fitted, index)
-    title = f"{clip}: the worst {play.time[window.end] - play.time[window.start]:.1f} seconds"
-    figure = fit_plots.worst_window(play, legs, window, title)
-    plots = save_plot(run, f"worst{ending}", title, figure)
-    return [bullets(identifiability_report.describe(play, window, legs)), gallery(plots)]
-
-
 def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playback) -> Plots:
     """Draws one clip with the system before and after the fit."""
     legs = fitted.problem.data[index].rig.names
@@ -165,7 +230,10 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
     ):
         title = f"{clip}: {subject}"
         plots |= save_plot(run, f"{name}{ending}", title, draw(title))
-    return plots
+    window = worst_window.find_worst_window(after)
+    title = f"{clip}: the worst {after.time[window.end] - after.time[window.start]:.1f} seconds"
+    figure = fit_plots.worst_window(after, legs, window, title)
+    return plots | save_plot(run, f"worst{ending}", title, figure)
 
 
 def _draw_search(run: Path, fitted: Fit) -> Plots:
@@ -183,48 +251,162 @@ def _draw_search(run: Path, fitted: Fit) -> Plots:
     return save_plot(run, "profiles.png", title, figure) | plots
 
 
-def _result(fitted: Fit) -> list[str]:
-    experiment, summary = fitted.experiment, fitted.summary
-    rules = "".join(f", `{stage}` by `{name}`" for stage, name in experiment.rules.items())
-    original = ", faithful to its original" if experiment.faithful else ""
-    return [
-        f"# {experiment.name}",
-        f"{summary['goodness']['sentence']} {summary['message']} {cost_sentence(fitted)}",
-        f"Preset `{experiment.preset}`{original}{rules}, loss `{experiment.loss}`, "
-        f"seed {experiment.seed}.",
-    ]
+def _ranges(fitted: Fit, parameters: Sequence[FittedParameter], label: str) -> Ranges:
+    space, truth = fitted.problem.space, fitted.known_values
+    docs = parameter_tree.docs(space.system)
+    rows = fit_figures.parameter_rows(
+        parameters,
+        {parameter.name: parameter.scale for parameter in space.parameters},
+        {parameter.name: docs.get(parameter.leaf, "") for parameter in space.parameters},
+        truth,
+    )
+    return Ranges(rows, label, RANGES, fit_tables.parameter_table(parameters, truth))
 
 
-def _check(fitted: Fit) -> list[str]:
-    if not fitted.check.lines:
-        return []
-    return ["## What these clips can tell", bullets(list(fitted.check.lines))]
-
-
-def _parameters(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
+def _parameters(fitted: Fit) -> Section:
     rows, truth = fitted.summary["parameters"], fitted.known_values
-    table = fit_tables.parameter_table(goodness_report.of_system(rows), truth)
-    parts = ["## Parameters", markdown(table)]
-    if truth:
-        parts.append(f"{fit_tables.recovered(rows, truth)}.")
-    if any("half_life" in row for row in rows):
-        parts.append(markdown(fit_tables.gain_table(rows)))
-    parts += goodness_report.capture_section(fitted, truth)
-    return [*parts, *prior_report.prior_section(rows), *identifiability_sections(fitted, clips)]
+    known = f"{fit_tables.recovered(rows, truth)}." if rows and truth else ""
+    return Section(
+        "Parameters",
+        [
+            _ranges(fitted, goodness_report.of_system(rows), "Free parameters"),
+            Grid(fit_tables.gain_table(rows), "Gains and their half-lives"),
+            Text(known, brief=True),
+        ],
+    )
 
 
-def _limits(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
-    parts = [
-        "## What the clips ask of the fitted system",
-        "Fraction of all frames, for each foot:",
-        markdown(fit_tables.activity_table(clips)),
-        "Fraction of frames that would look different if the limit were out of the way:",
-        markdown(fit_tables.limit_table(clips)),
+def _capture(fitted: Fit) -> Section:
+    rows = goodness_report.of_capture(fitted.summary["parameters"])
+    words = "What is not known of the captures, fitted along; no part of the system:"
+    return Section(
+        "The capture",
+        [
+            Text(words if rows else "", brief=True),
+            _ranges(fitted, rows, "Of the captures"),
+            Points(goodness_report.sentences(fitted), brief=True),
+        ],
+    )
+
+
+def _distances(fitted: Fit, motions: Sequence[ClipMotions]) -> Section:
+    blocks: list[Block] = [
+        Grid(goodness_report.distance_table(fitted.distances), "Distances from the captured motion")
     ]
-    if nudges := playback.nudge_thresholds(fitted.problem, fitted.solution.u):
-        parts.append(
+    if motions:
+        accuracies = fit_motions.summarised(motions)
+        table = fit_figures.accuracy_table(accuracies)
+        blocks.append(Grid(table, "Accuracy before and after the fit"))
+        for entry, clip in zip(fitted.experiment.clips, motions, strict=True):
+            name = f": {entry.reference.name}" if len(motions) > 1 else ""
+            table = fit_figures.placement_table(_placements(clip))
+            blocks += [Heading(f"Feet on the ground{name}"), Grid(table, "How feet are placed")]
+        blocks.append(
+            Text(
+                "Distances and angles are root mean squares. A slide or a pop counts by how far it "
+                "exceeds that of the flat animation; frames count from 0."
+            )
+        )
+    return Section("Before and after", blocks)
+
+
+def _worst(fitted: Fit) -> Section:
+    blocks: list[Block] = []
+    plays = zip(fitted.playbacks, fitted.problem.data, strict=True)
+    for index, (play, scene) in enumerate(plays):
+        window = worst_window.find_worst_window(play)
+        lines = identifiability_report.describe(play, window, scene.rig.names)
+        if len(fitted.playbacks) > 1:
+            blocks.append(Heading(fitted.experiment.clips[index].reference.name))
+        blocks += [Points(lines), Jump("Show them in the view", index)]
+    return Section("The worst two seconds", blocks)
+
+
+def _determined(fitted: Fit, activities: Sequence[ClipActivity]) -> list[Section]:
+    if not fitted.experiment.free_count:
+        return []
+    blocks = identifiability_report.determined_blocks(fitted, len(activities))
+    return [
+        prior_report.prior_section(fitted.summary["parameters"]),
+        Section("What these clips determine", blocks, on_page=False),
+    ]
+
+
+def _activity(measured: Measured) -> Section:
+    limits, idle = fit_figures.limit_table(measured.activities)
+    flips = fit_tables.flip_table(measured.nudges)
+    blocks: list[Block] = [
+        Text("Fraction of all frames, for each foot:"),
+        Grid(fit_tables.activity_table(measured.activities), "What the clips ask of the system"),
+    ]
+    if len(limits) > 1:
+        words = "Fraction of frames that would look different if the limit were out of the way:"
+        blocks += [Text(words), Grid(limits, "How often limits act")]
+    if idle:
+        blocks.append(Text(f"Limits that never act in these clips: {', '.join(idle)}."))
+    if measured.nudges:
+        words = (
             "Fraction of the feet's decisions (planted, lifted, locked, ground found) that flip "
             "when a threshold moves by 10 % of its range, and the rise in cost:"
         )
-        parts.append(markdown(fit_tables.flip_table(nudges)))
-    return parts
+        blocks += [Text(words), Grid(flips, "Decisions that hang on thresholds")]
+    return Section("What the clips ask of the fitted system", blocks)
+
+
+def _limits(fitted: Fit, activities: Sequence[ClipActivity]) -> Section:
+    missing = identifiability_report.missing_motion(fitted, activities)
+    blocks: list[Block] = []
+    if missing:
+        blocks.append(Text("What a clip would have to show to determine the rest:"))
+        blocks.append(Terms([[f"`{name}`", words] for name, words in missing]))
+    elif fitted.summary["parameters"]:
+        blocks.append(Text("These clips determine every free parameter."))
+    return Section("Limits of the data", [*blocks, Points(_remarks(fitted))])
+
+
+def _placements(clip: ClipMotions) -> dict[str, Placement]:
+    motions = {"flat animation": clip.animated, "before": clip.before}
+    motions |= {"fitted": clip.fitted, "captured": clip.captured}
+    return {name: motion.placement for name, motion in motions.items()}
+
+
+def _asked(fitted: Fit) -> Table:
+    """What the experiment asks for."""
+    experiment = fitted.experiment
+    sigmas = fitted.playbacks[0].sigmas
+    rows = [
+        ["System", pages.system(experiment)],
+        ["Free parameters", f"{len(experiment.free)}"],
+    ]
+    if experiment.capture:
+        rows.append(["Of the captures", f"{experiment.free_count - len(experiment.free)}"])
+    for number, (clip, entry) in enumerate(zip(fitted.clips, experiment.clips, strict=False), 1):
+        frames = clip.reference.frame_count
+        rows.append(
+            [
+                f"Clip {number}" if len(fitted.clips) > 1 else "Clip",
+                f"{entry.reference.name}: {frames} frames at {clip.reference.fps:g} Hz, "
+                f"{clip.reference.seconds:.1f} s, on {entry.terrain.name}",
+            ]
+        )
+    kinds = [f"{kind} {float(sigmas[kind]):.3g}" for kind in fitted.playbacks[0].fitted_kinds]
+    rows.append(["Noise, m and rad", ", ".join(kinds)])
+    return [*rows, pages.loss_and_seed(experiment)]
+
+
+def _remarks(fitted: Fit) -> list[str]:
+    """What limits the data of each clip."""
+    remarks = []
+    every = zip(fitted.clips, fitted.experiment.clips, fitted.problem.data, strict=False)
+    for clip, entry, scene in every:
+        name = entry.reference.name
+        observed = np.asarray(scene.reference.observed)
+        if missing := int(np.sum(~observed)):
+            remarks.append(f"{name}: {missing} of {len(observed)} frames are left out as not seen.")
+        if clip.reference.stance is None:
+            remarks.append(f"{name}: it has no contact labels; stances are found by its motion.")
+        remarks.append(f"{name}: root {clip.root.reason}.")
+        remarks += [f"{name}: {remark}" for remark in clip.reference.remarks]
+        if in_the_air := flight.describe(clip.base):
+            remarks.append(f"{name}: {in_the_air}.")
+    return remarks

@@ -1,4 +1,4 @@
-"""Goodness of fit: its text for the terminal, and its section of the run's summary.md."""
+"""Goodness of fit, and what is seen of the capture, in a fit's report."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,21 +19,11 @@ from fitting.motion.goodness import (
     pooled,
     size,
 )
-from fitting.report.formatting import (
-    RESIDUALS,
-    Table,
-    aligned,
-    bullets,
-    interval,
-    joined,
-    markdown,
-    number,
-    percent,
-)
+from fitting.report.document import Block, Grid, Heading, Text
+from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 
 from .capture_check import CaptureSigns
 from .fit import Fit, FittedParameter
-from .fit_tables import Truth, parameter_table
 
 NOISE = (
     "Noise and found correlation are those of the errors themselves; left is the correlation from "
@@ -54,24 +44,15 @@ COUNTED = (
     "their size and correlation say. The best point does not depend on that."
 )
 
-HEADING = "The capture"
 
-
-def text(fitted: Fit) -> str:
-    """The verdict and the sizes of the residuals, for the terminal."""
-    distances = aligned(distance_table(fitted.distances))
-    return joined([fitted.verdict.sentence, distances, aligned(_size_table(fitted))], apart=True)
-
-
-def goodness_section(fitted: Fit) -> list[str]:
-    """Paragraphs of Markdown."""
-    parts = ["## Goodness of fit", f"**{fitted.verdict.sentence}**"]
-    parts.append(markdown(distance_table(fitted.distances)))
+def goodness_blocks(fitted: Fit) -> list[Block]:
+    """The sizes of the residuals, and whether they look like noise."""
+    sizes = Grid(_size_table(fitted), "Sizes of the residuals")
     if not fitted.has_noise:
-        return [*parts, TOLERANCES, markdown(tolerance_table(fitted.groups))]
-    parts += [_describe_sizes(fitted), markdown(_size_table(fitted))]
-    parts += noise_section(fitted)
-    return [*parts, NOISE, markdown(noise_table(fitted.groups))]
+        tolerances = Grid(tolerance_table(fitted.groups), "Errors and tolerances", brief=False)
+        return [sizes, Text(TOLERANCES), tolerances]
+    noise = Grid(noise_table(fitted.groups), "Residuals as noise", brief=False)
+    return [Text(_describe_sizes(fitted)), sizes, *noise_blocks(fitted), Text(NOISE), noise]
 
 
 def _size_table(fitted: Fit) -> Table:
@@ -184,21 +165,22 @@ def _p(value: float, group: Group) -> str:
     return f"< {SMALL:.4f}" if value < SMALL else f"{value:.4f}"
 
 
-def noise_section(fitted: Fit) -> list[str]:
-    """Paragraphs of Markdown; none if nothing was estimated."""
+def noise_blocks(fitted: Fit) -> list[Block]:
+    """What was estimated of the noise; nothing if nothing was."""
     options = fitted.experiment.noise
     if not options.estimates_any:
         return []
-    parts = ["### Noise"]
+    blocks: list[Block] = [Heading("Noise")]
     if options.sigmas == "estimated":
-        parts.append(markdown(_estimated_sigmas(fitted)))
+        blocks.append(Grid(_estimated_sigmas(fitted), "Estimated sigmas", brief=False))
     if options.correlation == "whitened":
-        parts.append(markdown(_estimated_correlations(fitted)))
+        correlations = _estimated_correlations(fitted)
+        blocks.append(Grid(correlations, "Estimated correlations", brief=False))
     if options.correlation == "counted":
-        parts.append(COUNTED.format(fitted.noise.weight))
+        blocks.append(Text(COUNTED.format(fitted.noise.weight)))
     if fitted.problem.loss == "student" and options.sigmas == "estimated":
-        parts.append(f"Student's t has {fitted.noise.tails:.3g} degrees of freedom.")
-    return parts
+        blocks.append(Text(f"Student's t has {fitted.noise.tails:.3g} degrees of freedom."))
+    return blocks
 
 
 def sigma_table(draws: Mapping[str, np.ndarray]) -> Table:
@@ -243,18 +225,6 @@ def of_system(rows: Sequence[FittedParameter]) -> list[FittedParameter]:
 def of_capture(rows: Sequence[FittedParameter]) -> list[FittedParameter]:
     """The rows of what is not known of captures."""
     return [row for row in rows if row.get("of") == "capture"]
-
-
-def capture_section(fitted: Fit, truth: Truth) -> list[str]:
-    """Paragraphs of Markdown; none where nothing of a capture was fitted or is seen."""
-    rows, seen = of_capture(fitted.summary["parameters"]), sentences(fitted)
-    if not rows and not seen:
-        return []
-    parts = [f"## {HEADING}"]
-    if rows:
-        parts.append("What is not known of the captures, fitted along; no part of the system:")
-        parts.append(markdown(parameter_table(rows, truth)))
-    return [*parts, bullets(seen)] if seen else parts
 
 
 def sentences(fitted: Fit) -> list[str]:

@@ -1,4 +1,4 @@
-"""Paragraphs and tables on how well the clips determine the parameters of a fit."""
+"""Sentences and tables on how well the clips determine the parameters of a fit."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,7 +7,8 @@ import numpy as np
 from fitting.motion.evidence import Evidence, describe_missing_motion, find_evidence
 from fitting.motion.playback import ClipActivity, Playback
 from fitting.motion.worst_window import WorstWindow
-from fitting.report.formatting import RESIDUALS, Table, bullets, interval, markdown, number, percent
+from fitting.report.document import Block, Grid, Points, Text
+from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 from fitting.runtime import activity
 from jaxik.maths import parameter_tree
 
@@ -28,35 +29,33 @@ DIRECTIONS = (  # of an offset up, forward and left: positive, negative
 )
 
 
-def sections(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
-    """The whole section as Markdown.
+def determined_blocks(fitted: Fit, clips: int) -> list[Block]:
+    """How well the clips determine the parameters, and by what.
 
     Args:
         fitted: the fit.
-        clips: what each clip demands of the fitted system.
+        clips: how many there are.
     """
     known, rows = fitted.identifiability, fitted.summary["parameters"]
     names = ", ".join(f"`{name}`" for name in known.undetermined)
-    parts = [
-        "## What these clips determine",
-        f"Not determined: {names}." if names else "All free parameters are determined.",
-        DETERMINED,
-        markdown(verdict_table(rows)),
+    blocks: list[Block] = [
+        Text(f"Not determined: {names}." if names else "All free parameters are determined."),
+        Text(DETERMINED),
+        Grid(verdict_table(rows), "How well parameters are determined", brief=False),
     ]
     if known.ridges:
         parameters = {p.name: p for p in fitted.problem.space.parameters}
-        parts.append("Determined only together, while each alone is not:")
-        parts.append(bullets([ridge.describe(parameters) for ridge in known.ridges]))
+        blocks.append(Text("Determined only together, while each alone is not:"))
+        blocks.append(Points([ridge.describe(parameters) for ridge in known.ridges]))
     if known.correlated:
-        parts.append("Pairs of which these clips mostly determine one combination (correlation):")
         pairs = [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in known.correlated]
-        parts.append(bullets(pairs))
+        blocks += [
+            Text("Pairs of which these clips mostly determine one combination (correlation):"),
+            Points(pairs),
+        ]
     if known.weakest:
         together = ", ".join(f"`{name}`" for name in known.weakest)
-        parts.append(f"The least determined direction moves {together}.")
-    if names:
-        parts.append("What a clip would have to show to determine the rest:")
-        parts.append(markdown(missing_table(fitted, clips)))
+        blocks.append(Text(f"The least determined direction moves {together}."))
     evidence = {}
     title = f"Finding what determines {len(known.profiles)} parameters"
     with activity.announced(title, len(known.profiles)) as finding:
@@ -64,12 +63,15 @@ def sections(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
             evidence[name] = find_evidence(fitted.problem, fitted.playbacks, profile)
             finding.advance()
     if any(evidence.values()):
-        parts.append(
-            "What determines each parameter: when it leaves its interval, the cost rises, most of "
-            "all in this second of the clip and by residuals of this kind."
+        blocks.append(
+            Text(
+                "What determines each parameter: when it leaves its interval, the cost rises, most "
+                "of all in this second of the clip and by residuals of this kind."
+            )
         )
-        parts.append(markdown(evidence_table(evidence, len(clips))))
-    return parts
+        table = evidence_table(evidence, clips)
+        blocks.append(Grid(table, "What determines each parameter", brief=False))
+    return blocks
 
 
 def verdict_table(rows: Sequence[FittedParameter]) -> Table:
@@ -87,9 +89,9 @@ def verdict_table(rows: Sequence[FittedParameter]) -> Table:
     return table
 
 
-def missing_table(fitted: Fit, clips: Sequence[ClipActivity]) -> Table:
-    """The parameters that are not determined, and the motion that would determine them."""
-    known, table = fitted.identifiability, [["parameter", "a clip with"]]
+def missing_motion(fitted: Fit, clips: Sequence[ClipActivity]) -> list[list[str]]:
+    """The parameters that are not determined, each with the motion that would determine it."""
+    known, missing = fitted.identifiability, []
     docs = parameter_tree.docs(fitted.problem.space.system)
     declared = parameter_tree.declarations(fitted.problem.space.system)
     for parameter in fitted.problem.space.parameters:
@@ -104,8 +106,8 @@ def missing_table(fitted: Fit, clips: Sequence[ClipActivity]) -> Table:
                 known.profiles[parameter.name],
                 float(np.mean(active)) if active else None,
             )
-            table.append([parameter.name, words])
-    return table
+            missing.append([parameter.name, words])
+    return missing
 
 
 def evidence_table(evidence: Mapping[str, Sequence[Evidence]], clips: int) -> Table:

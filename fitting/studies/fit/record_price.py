@@ -14,7 +14,8 @@ from fitting.motion import goodness, playback
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.space import Vector
-from fitting.report.formatting import RESIDUALS, Table, aligned, joined, markdown, number
+from fitting.report.document import Block, Grid, Section, Text
+from fitting.report.formatting import RESIDUALS, Table, number
 from fitting.runtime.precision import in_float64
 
 from .assess import search
@@ -74,17 +75,12 @@ def _errors(problem: Problem[jaxik.FootIK], u: Vector) -> dict[str, float]:
     return {kind: math.sqrt(np.concatenate(parts).mean()) for kind, parts in squares.items()}
 
 
-def text(experiment: Experiment, price: RecordPrice | None) -> str:
-    """The price, for the terminal."""
-    if price is None:
-        return _sentence(experiment, price)
-    return joined([_sentence(experiment, price), aligned(_table(price))], apart=True)
-
-
-def section(experiment: Experiment, price: RecordPrice | None) -> list[str]:
-    """Paragraphs of Markdown."""
-    parts = ["## What the record costs", _sentence(experiment, price)]
-    return parts if price is None else [*parts, markdown(_table(price))]
+def section(experiment: Experiment, price: RecordPrice | None) -> Section:
+    """What the report says of the price."""
+    blocks: list[Block] = [Text(_sentence(experiment, price), brief=True)]
+    if price is not None:
+        blocks.append(Grid(_table(price), "Errors with and without the restriction"))
+    return Section("What the record costs", blocks)
 
 
 def _sentence(experiment: Experiment, price: RecordPrice | None) -> str:

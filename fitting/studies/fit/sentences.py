@@ -6,17 +6,22 @@ from collections.abc import Mapping, Sequence
 from fitting.motion.accuracy import Accuracy
 from fitting.report.formatting import percent
 
+from . import fit_motions
 from .fit import Fit
 from .fit_motions import ClipMotions
 
 NAMED = 3  # parameters that are not determined, of which all are named if there are no more
 
 
-def findings(
-    fitted: Fit, motions: Sequence[ClipMotions], accuracies: Mapping[str, Accuracy]
-) -> list[str]:
-    """How close the motion is, what is determined, and how the feet stand: a sentence each."""
-    return [_closeness(fitted, accuracies), _determined(fitted), _feet(motions)]
+def findings(fitted: Fit, motions: Sequence[ClipMotions]) -> list[str]:
+    """How close the motion is, what is determined, and how the feet stand: a sentence each.
+
+    Without the motions, only what is determined.
+    """
+    if not motions:
+        return [_determined(fitted)]
+    closeness = _closeness(fitted, fit_motions.summarised(motions))
+    return [closeness, _determined(fitted), _feet(motions)]
 
 
 def verdict_word(fitted: Fit) -> str:

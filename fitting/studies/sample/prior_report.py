@@ -3,24 +3,24 @@
 from collections.abc import Mapping, Sequence
 
 from fitting.inference.sample.prior_sensitivity import MAX_K, Reweighted
-from fitting.report.document import Block, Grid, Heading, Text
-from fitting.report.formatting import Table, interval, markdown, number
+from fitting.report.document import Block, Grid, Heading, Section, Text
+from fitting.report.formatting import Table, interval, number
 from fitting.studies.fit.fit import FittedParameter
 
 from .sample import SampledFit
 
 
-def prior_section(rows: Sequence[FittedParameter]) -> list[str]:
-    """Paragraphs of Markdown: what a prior is, and the table of them."""
-    return [
-        "## Priors",
+def prior_section(rows: Sequence[FittedParameter]) -> Section:
+    """What a prior is, and the table of them."""
+    explanation = (
         "What was known of the parameters before these clips, beside what the fit leaves of it. A "
         "normal prior is one of `u`, the parameter's range stretched to a coordinate without "
         "bounds; the spread is its standard deviation there. Unless the experiment says otherwise, "
         "it is centred at the system's value, or, where that is in the outer sixth of the range, a "
-        "sixth inside. A uniform prior is the range itself.",
-        markdown(prior_table(rows)),
-    ]
+        "sixth inside. A uniform prior is the range itself."
+    )
+    grid = Grid(prior_table(rows), "Priors", brief=False)
+    return Section("Priors", [Text(explanation), grid], on_page=False)
 
 
 def prior_table(rows: Sequence[FittedParameter]) -> Table:
