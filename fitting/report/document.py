@@ -20,7 +20,6 @@ from . import formatting, motion_data, pages, style
 from .formatting import JoinedText, Table, aligned, bullets, joined
 from .motion_data import ShownClip
 
-ASKED = "What was asked"
 START, END = "<!-- posterior -->", "<!-- /posterior -->"  # no text of a user can hold them
 
 
@@ -189,6 +188,11 @@ class Document:
         numbers = dict.fromkeys(self.numbers, "all numbers")
         return {self.file: "the text", **numbers, **self.files, **plots}
 
+    @property
+    def whole(self) -> list[Section]:
+        """All sections, what was asked last."""
+        return [*self.sections, Section("What was asked", [Terms(self.asked)])]
+
     def write(self, folder: Path) -> None:
         """Draws the plots, and writes the numbers, and the document as Markdown and as a page.
 
@@ -202,10 +206,9 @@ class Document:
         pictures = _pictures(folder, self.sections)
         spent = sum(picture.size for picture in pictures.values())
         clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
-        pages.write(
-            folder / pages.PAGE, "document.html", clips, document=self, title=self.title,
-            sections=_on_page(self.sections), pictures=pictures,
-        )  # fmt: skip
+        sections = _on_page(self.whole)
+        html = pages.render(clips, document=self, sections=sections, pictures=pictures)
+        files.write_text(folder / pages.PAGE, html)
 
 
 def add(folder: Path, file: str, title: str, sections: Sequence[Section]) -> None:
@@ -305,14 +308,13 @@ def brief(sections: Sequence[Section]) -> JoinedText:
 
 def _whole(document: Document) -> str:
     """The whole document in Markdown, but for the view."""
-    sections = [*document.sections, Section(ASKED, [Terms(document.asked)])]
     others = (f"[{name}]({name}) has {words}" for name, words in document.beside.items())
     parts = [
         f"# {document.title}",
         f"{document.kind}: **{document.verdict}**.",
         bullets(document.sentences),
         *filter(None, [document.note]),
-        *markdown(sections),
+        *markdown(document.whole),
         f"More in this folder: {', '.join(islice(others, 1, None))}.",
     ]
     return "\n\n".join(parts) + "\n"

@@ -15,7 +15,6 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from fitting.experiment.experiment import ClipEntry, Experiment
-from fitting.runtime import files
 
 from . import style
 from .formatting import Table
@@ -44,17 +43,16 @@ MAX_BYTES = 2_500_000  # of all pictures of a page
 SMALLER = 0.8  # of its width, as often as it takes
 
 
-def render(template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
+def render(clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
     """A page as HTML. What is not marked as HTML is escaped.
 
     Args:
-        template: name of the file in `templates`.
         clips: what the view shows, as `motion_data.pack` gives it; none for a page without a view.
         content: the template's variables.
     """
     scripts = (*SCRIPTS, *VIEWER_SCRIPTS) if clips else SCRIPTS
     return fragment(
-        template,
+        "document.html",
         **content,
         data=as_json({"clips": clips}),
         colours=COLOURS,
@@ -67,11 +65,6 @@ def render(template: str, clips: Sequence[Mapping[str, Any]], **content: Any) ->
 def fragment(template: str, **content: Any) -> str:
     """A part of a page as HTML. What is not marked as HTML is escaped."""
     return _environment().get_template(template).render(**content)
-
-
-def write(path: Path, template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> None:
-    """Writes a page; see `render`."""
-    files.write_text(path, render(template, clips, **content))
 
 
 def prose(text: str) -> Markup:

@@ -49,16 +49,12 @@ from fitting.report.style import (
 )
 from fitting.runtime.precision import in_float64
 
-from . import comparison as compare_comparison
 from .animations import JOINTS
-from .comparison import ANIMATED, ComparedMotions, Comparison
-from .comparison import ANIMATED as ANIMATION
+from .comparison import ANIMATED, ComparedMotions, Comparison, of_comparison
 from .fit import fit_figures
 from .fit.sentences import listed
 
 TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
-
-
 RATES = (
     "How far joints are from where they are at the clip's own rate: rms over frames and legs, and "
     "the largest distance. Labels, strides, speeds and root stay those at the clip's own rate, as "
@@ -212,7 +208,7 @@ def _bars(
 @in_float64
 def document(comparison: Comparison) -> Document:
     """What a comparison says."""
-    compared = compare_comparison.of_comparison(comparison)
+    compared = of_comparison(comparison)
     systems = tuple(comparison.placements)
     placements = {name: compared.motions[name].placement for name in systems}
     failing = beyond(placements)
@@ -493,15 +489,15 @@ def shown(compared: ComparedMotions, systems: tuple[str, ...], watched: str) -> 
         watched: the one that is watched at first, if it gave a motion.
     """
     flat = motion_data.ANIMATED._replace(colour=BEFORE)
-    looks = {ANIMATION: flat} | {
+    looks = {ANIMATED: flat} | {
         name: Look(COLOURS[index % len(COLOURS)], RADIUS) for index, name in enumerate(systems)
     }
     motions = {
         key(name): ShownMotion(
-            "flat animation" if name == ANIMATION else name,
+            "flat animation" if name == ANIMATED else name,
             motion,
             looks[name],
-            visible=name != ANIMATION,
+            visible=name != ANIMATED,
             worst=compared.worst[name],
         )
         for name, motion in compared.motions.items()
@@ -514,7 +510,7 @@ def shown(compared: ComparedMotions, systems: tuple[str, ...], watched: str) -> 
         motions,
         compared.stance,
         compared.ground,
-        watched=key(watched if watched in compared.motions else ANIMATION),
+        watched=key(watched if watched in compared.motions else ANIMATED),
     )
 
 

@@ -99,7 +99,7 @@ REASONS = {
     "jaxik/solvers/reach.py": [("has_room, room, 1.0", "has_room, room, 2.0", STAND_IN)],
     "jaxik/stages/fade.py": [
         ("beyond, distance, 1.0", "beyond, distance, 2.0", STAND_IN),
-        ("(limited, gap, 1.0), 1.0)", "(limited, gap, 1.0), 2.0)", STAND_IN),
+        ("(behind, gap, 1.0), 0.0)", "(behind, gap, 1.0), 1.0)", STAND_IN),
     ],
     "jaxik/stages/pelvis/games.py": [
         ("goal - state.height", "goal + state.height", "only tells whether to jump, by 0.1 mm")

@@ -249,9 +249,10 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
 def test_the_second_of_two_clips_has_its_own_plots(fitted, twice, tmp_path, undrawn):
     (after,) = fitted.playbacks
     plots = fit_report._draw_clip(tmp_path, twice, 1, after, after)
-    assert set(plots) == {f"{name}_2.png" for name in (*CLIP_PLOTS, "worst")}
-    assert all(caption.startswith("hill, clip 2: ") for caption in plots.values())
-    assert plots["worst_2.png"] == "hill, clip 2: the worst 1.9 seconds"
+    captions = {plot.name: plot.caption for plot in plots}
+    assert set(captions) == {f"{name}_2.png" for name in (*CLIP_PLOTS, "worst")}
+    assert all(caption.startswith("hill, clip 2: ") for caption in captions.values())
+    assert captions["worst_2.png"] == "hill, clip 2: the worst 1.9 seconds"
 
 
 def test_a_playback_has_the_residuals_of_the_fit_and_rebuilds_captured_joints(fitted):

@@ -1,4 +1,4 @@
-"""Tables and interval plots of a fit's page."""
+"""Interval plots of a fit's parameters, and tables of its motions."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,10 +8,9 @@ from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import Placement
 from fitting.motion.playback import ClipActivity
 from fitting.report.document import ParameterRow
-from fitting.report.formatting import ACCURACY, Table, headings, interval, number
+from fitting.report.formatting import ACCURACY, Table, headings, interval, number, percent
 from fitting.studies import animations
 
-from . import fit_tables
 from .fit import FittedParameter
 from .fit_tables import Truth, verdict
 
@@ -72,10 +71,12 @@ def _parameter_row(row: FittedParameter, scale: str, doc: str, truth: Truth) -> 
 
 
 def limit_table(clips: Sequence[ClipActivity]) -> tuple[Table, list[str]]:
-    """How often limits act, and the names of those that never do."""
-    table = fit_tables.limit_table(clips)
+    """In which fraction of frames limits change the pose, by clip; names of those that never do."""
+    names = [f"clip {i + 1}" for i in range(len(clips))] if len(clips) > 1 else ["frames"]
     idle = [name for name in clips[0].limits if not any(clip.limits[name] for clip in clips)]
-    return [row for row in table if row[0] not in idle], idle
+    active = [name for name in clips[0].limits if name not in idle]
+    rows = [[name, *(percent(clip.limits[name]) for clip in clips)] for name in active]
+    return [["limit", *names], *rows], idle
 
 
 def accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:

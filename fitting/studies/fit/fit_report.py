@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -58,7 +58,6 @@ RANGES = (
     "dashed grey where they do not. Grey tick: before the fit. Green line: the true value, where "
     "it is known."
 )
-Plots: TypeAlias = dict[str, str]  # captions by file name
 
 
 class Measured(NamedTuple):
@@ -93,7 +92,7 @@ def write_fit(
         details: sections to insert before the pictures.
         rehearsal: of the fit's problem, if one has begun.
     """
-    plots: Plots = {}
+    plots: list[Plot] = []
     with activity.announced("Playing the clips with the system before the fit"):
         before = (rehearsal or Rehearsal(fitted.problem)).results()
     with ExitStack() as drawing, calls_beside():
@@ -103,15 +102,14 @@ def write_fit(
         for index, (scene, after) in enumerate(plays):
             with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
                 first = playback.play(scene, before[index])
-                plots |= _draw_clip(run, fitted, index, first, after)
+                plots += _draw_clip(run, fitted, index, first, after)
         with activity.announced("Measuring where limits are in effect"):
             measured = Measured(
                 before,
                 playback.measure(fitted.ik, fitted.scenes, fitted.results),
                 playback.nudge_thresholds(fitted.problem, fitted.solution.u),
             )
-        pictures = [Plot(name, caption) for name, caption in (plots | curves).items()]
-        details = [*details, Section("Pictures", pictures, on_page=False)]
+        details = [*details, Section("Pictures", [*plots, *curves], on_page=False)]
         report = fit_document(fitted, measured, opening, details)
         with activity.announced("Writing the page"):
             report.write(run)
@@ -184,10 +182,9 @@ def shown(clip: ClipMotions, label: str, window: WorstWindow) -> ShownClip:
     )
 
 
-def save_plot(run: Path, name: str, caption: str, figure: Figure) -> Plots:
-    """Saves a figure; returns its file name with the caption."""
+def _save(run: Path, name: str, caption: str, figure: Figure) -> Plot:
     style.save(run / name, figure)
-    return {name: caption}
+    return Plot(name, caption)
 
 
 def cost_sentence(fitted: Fit) -> str:
@@ -213,13 +210,13 @@ def _clip_names(fitted: Fit, index: int) -> tuple[str, str]:
     return title, f"_{index + 1}.png" if several else ".png"
 
 
-def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playback) -> Plots:
+def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playback) -> list[Plot]:
     """Draws one clip with the system before and after the fit."""
     legs = fitted.problem.data[index].rig.names
     clip, ending = _clip_names(fitted, index)
     leg = fitted.ik.leg
     limits = [float(np.mean(getattr(leg, name))) for name in KNEE_LIMITS if hasattr(leg, name)]
-    plots: Plots = {}
+    plots: list[Plot] = []
     for name, subject, draw in (
         ("motion", "heights of feet and pelvis", lambda t: fit_plots.motion(after, legs, t)),
         ("side_view", "legs over the ground", lambda t: fit_plots.side_view(after, legs, t)),
@@ -229,26 +226,26 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
         ("noise", "are the residuals noise?", lambda t: fit_plots.noise(after, t)),
     ):
         title = f"{clip}: {subject}"
-        plots |= save_plot(run, f"{name}{ending}", title, draw(title))
+        plots.append(_save(run, f"{name}{ending}", title, draw(title)))
     window = worst_window.find_worst_window(after)
     title = f"{clip}: the worst {after.time[window.end] - after.time[window.start]:.1f} seconds"
     figure = fit_plots.worst_window(after, legs, window, title)
-    return plots | save_plot(run, f"worst{ending}", title, figure)
+    return [*plots, _save(run, f"worst{ending}", title, figure)]
 
 
-def _draw_search(run: Path, fitted: Fit) -> Plots:
+def _draw_search(run: Path, fitted: Fit) -> list[Plot]:
     """Draws the curves of the parameters and the course of the search, where there was one."""
     if not fitted.experiment.free_count:
-        return {}
+        return []
     title = f"{fitted.experiment.name}: cost of the fit over time"
     cost = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
-    plots = save_plot(run, "cost.png", title, cost)
+    plot = _save(run, "cost.png", title, cost)
     title = f"{fitted.experiment.name}: how the cost rises over the range of each parameter"
     units = {row["name"]: row["unit"] for row in fitted.summary["parameters"]}
     parameters = {parameter.name: parameter for parameter in fitted.problem.space.parameters}
     profiles = fitted.identifiability.profiles
     figure = fit_plots.profiles(parameters, profiles, units, fitted.known_values, title)
-    return save_plot(run, "profiles.png", title, figure) | plots
+    return [_save(run, "profiles.png", title, figure), plot]
 
 
 def _ranges(fitted: Fit, parameters: Sequence[FittedParameter], label: str) -> Ranges:

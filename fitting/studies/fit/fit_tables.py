@@ -89,15 +89,6 @@ def activity_table(clips: Sequence[ClipActivity]) -> Table:
     return table
 
 
-def limit_table(clips: Sequence[ClipActivity]) -> Table:
-    """Fraction of frames in which each limit changes the pose, a column for each clip."""
-    names = [f"clip {i + 1}" for i in range(len(clips))] if len(clips) > 1 else ["frames"]
-    table = [["limit", *names]]
-    for name in clips[0].limits:
-        table.append([name, *(percent(clip.limits[name]) for clip in clips)])
-    return table
-
-
 def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
     """Thresholds: decisions that flip, and the rise in cost, when one moves by 10 % of its range.
 
