@@ -19,6 +19,7 @@ from fitting.experiment.problems import load_clip_data, make_problem
 from fitting.experiment.systems import Preset
 from fitting.motion import playback
 from fitting.problem.scene import legs_ws, pelvis_ws
+from fitting.report.document import Grid, Text
 from fitting.studies import ablation, animation_jobs
 from fitting.studies.animations import AnimationFiles
 from fitting.studies.fit import fit_jobs, record_price
@@ -374,9 +375,10 @@ def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkey
     ankle = np.sqrt(np.mean(play.errors["ankle"] ** 2))
     assert price.errors["ankle"][0] == pytest.approx(ankle)
     assert price.errors["ankle"][1] != pytest.approx(ankle)
-    text, section = fit_jobs._price_of_record(fitted, None, lines.append)
+    (section,) = fit_jobs._price_of_record(fitted, None, lines.append)
+    sentence, table = section.blocks
+    assert isinstance(sentence, Text) and isinstance(table, Grid)
     assert lines == ["what the record costs: a search in which target.rise_half_life are free, too"]
     said = "The cost is 3; with these free, too, a search from there ends at 2."
-    assert said in "".join(text) and said in section[1]
-    assert "not target.rise_half_life: " in section[1]
-    assert f"| Ankle position | {100 * ankle:.4g} cm |" in section[2]
+    assert said in sentence.text and "not target.rise_half_life: " in sentence.text
+    assert table.rows[1][:2] == ["Ankle position", f"{100 * ankle:.4g} cm"]

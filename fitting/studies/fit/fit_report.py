@@ -139,6 +139,9 @@ def fit_document(
     if measured is not None:
         sections += [_worst(fitted), *_determined(fitted, measured.activities)]
         sections += [_activity(measured), _limits(fitted, measured.activities)]
+    closing = [summary["message"], cost_sentence(fitted)]
+    if not sentences.is_worse(fitted):
+        closing.insert(0, fitted.verdict.sentence)
     return Document(
         file=SUMMARY,
         kind="Foot IK fitted to captured motion",
@@ -150,7 +153,7 @@ def fit_document(
         asked=_asked(fitted),
         files={FIT: "all numbers", PARAMETERS: "the fitted system"},
         view=_view(fitted, motions) if motions else None,
-        note=f"{fitted.verdict.sentence} {summary['message']} {cost_sentence(fitted)}",
+        note=" ".join(closing),
     )
 
 

@@ -16,19 +16,25 @@ NAMED = 3  # parameters that are not determined, of which all are named if there
 def findings(fitted: Fit, motions: Sequence[ClipMotions]) -> list[str]:
     """How close the motion is, what is determined, and how the feet stand: a sentence each.
 
-    Without the motions, only what is determined.
+    What the fit has made worse comes first. Without the motions, the rest is what is determined.
     """
+    worse = [fitted.verdict.sentence] if is_worse(fitted) else []
     if not motions:
-        return [_determined(fitted)]
+        return [*worse, _determined(fitted)]
     closeness = _closeness(fitted, fit_motions.summarised(motions))
-    return [closeness, _determined(fitted), _feet(motions)]
+    return [*worse, closeness, _determined(fitted), _feet(motions)]
+
+
+def is_worse(fitted: Fit) -> bool:
+    """Whether the fit is visibly further from a capture than what there was before it."""
+    return fitted.has_noise and bool(fitted.distances.setbacks)
 
 
 def verdict_word(fitted: Fit) -> str:
     """The verdict in two or three words."""
     if not fitted.summary["converged"]:
         return "Not converged"
-    if fitted.has_noise and fitted.distances.setbacks:
+    if is_worse(fitted):
         return "Worse"
     if fitted.has_noise:
         return "Fits" if fitted.verdict.fits else "Does not fit"
