@@ -35,7 +35,7 @@ from fitting.report import document, pages
 from fitting.report.document import Grid, Section, Text
 from fitting.report.formatting import markdown
 from fitting.runtime import display
-from fitting.studies.fit import fit_report, goodness_report, run_folder
+from fitting.studies.fit import fit_report, goodness_report, run_folder, sentences
 from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import posterior_plots, posterior_report, prior_report
@@ -163,6 +163,21 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     shown = [float(number) for number in (half_life, gain, gain_at_60)]
     expected = [np.log(0.5) / np.log(0.7) / 30.0, 0.3, 1 - np.sqrt(0.7)]
     np.testing.assert_allclose(shown, expected, rtol=1e-3)
+
+
+def test_what_the_fit_has_made_worse_is_the_first_sentence(fitted):
+    text = fit_report.fit_text(fitted)
+    assert ("Worse" in text) == bool(fitted.distances.setbacks) == sentences.is_worse(fitted)
+    worse, tolerated = replace(fitted), replace(fitted, has_noise=False)
+    near, far = dict.fromkeys(goodness.CLOSE, 0.001), dict.fromkeys(goodness.CLOSE, 0.019)
+    motions: Any = {"animation": near, "before": near, "fitted": far}
+    for each in (worse, tolerated):
+        vars(each)["distances"] = goodness.Distances({"held_out": motions})
+    lines = fit_report.fit_text(worse).split("\n\n")
+    assert lines[0] == "Not converged."  # which is as it was invented
+    assert lines[1].startswith("- Worse: ") and "off the capture in held-out frames" in lines[1]
+    assert "\n\n".join(lines).count("Worse: ") == 1
+    assert "Worse" not in fit_report.fit_text(tolerated)
 
 
 def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
