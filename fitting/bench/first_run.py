@@ -3,6 +3,12 @@
 `python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
 folder, as a command or a notebook would, and prints the seconds until the first number and until
 the end.
+
+What a newcomer waits for: a first fit, a first posterior, the first cells of a notebook.
+
+`python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
+folder, as a command or a notebook would, and prints the seconds until the first number and until
+the end.
 """
 
 import json

@@ -7,6 +7,11 @@ stand for as long as they stay within the noise of their place.
 
 Limits are for an adult. A body twice as large moves twice as fast if it plays the same animation,
 and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
+
+Noise of captured points, and how much smoothing takes it out of their speeds.
+
+Noise is seen in fourth differences: a body moves too smoothly to have any at the rates of captures,
+least of all while a foot stands, so that a low quantile of them shows noise alone.
 """
 
 from collections.abc import Sequence

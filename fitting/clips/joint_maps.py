@@ -2,6 +2,19 @@
 
 Roles are recognised by joint name, in one of the naming conventions of `clips.joint_maps`, or named
 by the caller.
+
+Naming conventions of joints: a table, and what recognises them in a skeleton.
+
+A convention is recognised with any prefix that its joints have in common: `mixamorig:`, `Bip01 `,
+`DEF-`, `CC_Base_`, or the name of a character.
+
+Joint maps: TOML files in which a user says which joint of a skeleton is which.
+
+pelvis = "Hüfte"
+hip_left = "Oberschenkel.L"     # legs may have any names; those that end in l or left are left legs
+knee_left = "Unterschenkel.L"
+ankle_left = "Fuß.L"
+toe_left = "Zehen.L"            # may be left out
 """
 
 import re

@@ -1,4 +1,9 @@
-"""Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints."""
+"""Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints.
+
+Geometry of two-bone legs over the frames of a clip: hinges, knees and bone rotations.
+
+All arrays are float64 in world space with frames leading, (frames, 3) unless said otherwise.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -5,6 +5,34 @@ name = "support"
 rules = { pelvis = "LowestPelvis" }     # other rules, by stage
 parameters = { lock.enabled = false }   # fixed at these values, even if they are free otherwise
 free = { pelvis.limit = {} }            # fitted in addition
+
+The table [capture] of an experiment: what of the captures is fitted beside the system.
+
+[capture]
+ground_height = {}                    # for each clip; {} takes the range from `Capture`
+time_shift = { low = -0.05, high = 0.05 }
+"ankle_up[1]" = {}                    # of the second clip only
+[prior.capture]                       # narrow unless it says otherwise
+ground_height = { centre = 0.03 }
+
+The table [hierarchy] of an experiment file: what several clips and subjects have in common.
+
+[hierarchy]
+per_subject = ["target.foot_height"]  # one value for each subject that [[clips]] name
+per_clip = ["lean.gain"]              # one for each clip; all other free parameters are shared
+scale_with_body = true                # numbers are for the body of the first clip, or the adult
+                                      # (`body`); those of other bodies are dynamically similar
+
+The tables [prior] and [start] of an experiment file: what is known before any clip.
+
+[prior]                              # of every free parameter that has no table of its own
+shape = "normal"                     # or "uniform": anywhere in the range
+spread = 1.6                         # standard deviation, of u
+[prior.pelvis]
+on_gain = { centre = 0.3, spread = 1.0 }  # median, in the parameter's unit
+limit = { shape = "uniform" }
+[start]                              # where the search begins, in the parameters' units
+pelvis.on_gain = 0.5
 """
 
 import dataclasses

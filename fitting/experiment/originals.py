@@ -1,4 +1,22 @@
-"""Parameters as settings of an original, and settings as parameters."""
+"""Parameters as settings of an original, and settings as parameters.
+
+The settings of each original: their names, units, and the parameters that they are.
+
+Names are spelled as where they are set: members of ozz's sample (constants of its source among
+them), variables of Unreal's character in C++, and fields of Mec's inspector in Unity.
+
+Tables of settings as files: TOML, JSON and CSV.
+
+TOML and JSON have the name of the original, the settings, and their units where they have one:
+
+system = "unreal"
+[settings]
+m_IKTraceDistance = 50.0
+[units]
+m_IKTraceDistance = "cm"
+
+CSV has a row for each setting, with the columns system, setting, value and unit.
+"""
 
 import contextlib
 import csv

@@ -3,6 +3,11 @@
 Keys, meanings, units, ranges and choices are those by which files are checked,
 defaults those of the classes that it makes, and parameters those that the rules declare. Checks
 across keys, and of other files, are left to the reader: what the schema allows may be refused.
+
+JSON Schema of what experiments say of a system: rules, parameters, and which are free.
+
+A table such as [parameters] may hold what any rule of a stage has. Which rule a file has follows
+from its preset and its [rules], so conditions then allow only the names of that rule.
 """
 
 import dataclasses

@@ -1,4 +1,21 @@
-"""Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes."""
+"""Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes.
+
+Heightfields as files, which `load_terrain` reads beside meshes.
+
+`.npz`, as `numpy.savez` writes it; it states its own spacing:
+
+    heights         (rows, columns), m; rows along z, columns along x; NaN leaves holes
+    spacing         m, between neighbours; two numbers are those along x and along z
+    origin          (3), m, of row 0 and column 0 at height 0; where missing, zero
+    interpolation   "bilinear" or "triangulated"; where missing, "bilinear"
+
+`.npy`, as `numpy.save` writes it: the heights alone. `.png`: a grey picture of 8 or 16 bits, whose
+levels are heights; x goes right and z goes down in it. It may be stored in colours of 8 bits, as
+long as all of them are grey and opaque. For both the user says how far neighbours
+are apart, the cell, and for a picture also how many metres a level is.
+
+`jaxik.world.terrain.heightfield` says more about each array.
+"""
 
 import io
 import logging
@@ -89,7 +106,7 @@ def load_terrain(
 
     Args:
         path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads; or a heightfield as NPZ, NPY
-            or PNG, see `heightfield_files`.
+            or PNG, as the module says.
         up: direction opposite to the rays that probe the ground, and of a heightfield's heights;
             world space, any length.
         layer: 0 to 31, of all triangles.

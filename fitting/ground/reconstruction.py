@@ -3,6 +3,13 @@
 Three kinds of surface are fitted to the footprints: a plane, a smooth thin plate and level blocks
 on a grid. Each predicts the height of every footprint from the others, and the simplest kind that
 no other predicts clearly better is chosen.
+
+Finds the square grid of level blocks that best explains where feet stood, and how high.
+
+Pitch, heading and offset of the grid are unknown, and so is the height of every block. A grid is
+scored by its evidence: the probability of all measured heights with the unknown block heights
+integrated out (MacKay, "Bayesian interpolation", 1992). Evidence penalises complexity by itself:
+grids with blocks that are too small, or too many, score lower unless the heights require them.
 """
 
 from abc import ABC, abstractmethod

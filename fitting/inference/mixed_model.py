@@ -4,6 +4,25 @@ It alternates, as Lindstrom and Bates (1990) do for nonlinear mixed models, betw
 model that the clips' residuals give around their present parameters, which has the most probable
 spreads, and a step of Gauss and Newton towards its mode, halved until the cost falls. Thresholds
 are held: they have no derivatives.
+
+Quadratic approximations: of a clip's likelihood around a point, and of the prior.
+
+Of the likelihood it is that of Gauss and Newton, with the Fisher information where the loss has
+one, as for Laplace's approximation of a single fit. It takes no program that a search has not
+compiled already.
+
+The linear mixed model: quadratic likelihoods of several clips, tied by a population.
+
+Minus the log-likelihood of clip c is `½ u'A_c u - a_c'u`. A parameter of it is
+
+    u = centre                        where all clips share it
+    u = centre + spread z_g           where it varies: z_g is standard normal, one for each group
+
+which is the non-centred form: it has no singularity where the spread is 0 and all groups are alike.
+Given the spreads, centres and z are normal, and integrated out exactly. Centres have the prior of
+the parameters. Spreads have a half-normal prior with the standard deviation that the parameters'
+prior has: groups differ no more than the prior allows a parameter to vary. Its density is highest,
+and finite, at 0; with flat priors this is restricted maximum likelihood (REML).
 """
 
 import dataclasses

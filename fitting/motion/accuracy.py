@@ -2,6 +2,11 @@
 
 The definitions are those of the benchmark's own scoring script, against which the tests check
 them. NumPy; world space, y up.
+
+How far a system's motion is from its reference, and how much of the reference it reproduces.
+
+The reference is what another system made of the same animation. What that system changed in the
+animation is its correction; what the fitted system does not reproduce of it remains.
 """
 
 from collections.abc import Mapping, Sequence

@@ -9,6 +9,11 @@ The pelvis keeps its path in the ground plane at a constant height: what it does
 for foot IK to find. Where the ground is flat, there is nothing to find, and the clip itself is such
 an animation: the pelvis moves as captured. Knees follow from the law of
 cosines, in the plane in which the captured leg bends.
+
+Swings that the start of a clip cuts off, on ground that is higher where they began.
+
+Such a foot has left a foothold that the clip does not show. Without it, the foot swings at the
+height of its next foothold: down stairs, through those that it comes from.
 """
 
 from collections.abc import Callable

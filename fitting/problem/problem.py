@@ -1,4 +1,17 @@
-"""A space of systems together with the data they are fitted to."""
+"""A space of systems together with the data they are fitted to.
+
+Losses. All but the squares limit how far a few bad frames can pull a fit.
+
+A loss replaces the square `z` of a residual in sigmas by `rho(z)`, which is minus twice the
+logarithm of a density, up to a constant:
+
+    squares    z                               normal
+    huber      z up to HUBER², and 2 HUBER sqrt(z) - HUBER² beyond
+    cauchy     CAUCHY² log(1 + z / CAUCHY²)
+    student    (nu + 1) log(1 + z / nu)        Student's t with nu degrees of freedom
+
+Arrays are JAX's, or NumPy's where `library` says so.
+"""
 
 import dataclasses
 import hashlib

@@ -6,6 +6,12 @@ ray of a clip meets the ground of another, and all frames go through one loop, i
 starts anew at the first frame of each clip. Foot IK is the same wherever a world has its origin.
 
 Terrains that are no static meshes can be shared only by clips that have the same one.
+
+Clips of different length as one array, so that one program computes all of them.
+
+A clip is made longer by repeating its last frame, which then was not observed: nothing that a frame
+shows depends on later ones, and what was not observed has no residuals. Lengths are rounded up to a
+few, so that a thousand clips of a thousand lengths need a few programs.
 """
 
 import dataclasses

@@ -14,6 +14,24 @@ values of the system as it is, unless told otherwise. A value in the outer sixth
 means that something is off, and not how it is when it is on: such a prior is centred a sixth
 inside. A uniform prior of a parameter declared above another one is uniform between that one's
 value and the upper bound, whatever that value is.
+
+Which numbers of a system a fit may change: range, kind and scale of each.
+
+Arrays are JAX's, or NumPy's where `library` says so.
+
+What is known of the free parameters before any data: the prior of `u`.
+
+Each parameter has a prior of its own, independent of the others. In `u`, the coordinate without
+bounds of `space`, it has one of two shapes:
+
+    normal     log density = -½ ((u - centre) / spread)²          up to a constant
+    uniform    log density = -2 log cosh(u / 2)                   up to a constant
+
+The second is the logistic distribution, whose image under the sigmoid is uniform: the value is
+anywhere in its range with equal density, on the parameter's scale (linear, logarithmic or by way of
+the half-life). The solver needs residuals, half of whose squares' sum is minus the log density; the
+sampler takes the same function, and since both see densities of `u`, no Jacobian of the transform
+enters.
 """
 
 import dataclasses

@@ -1,6 +1,12 @@
 """The folder in which programs are kept between processes: where it is, and what lies in it.
 
 It is JAX's folder for compiled programs. The traced ones lie in a folder inside it.
+
+JAX's files of compiled programs, each of which is to be complete or missing.
+
+JAX (0.10.2 to 0.12.0.1) writes such a file in place, and never again once it is there. A process
+that reads it at that moment warns and compiles for itself; one that is killed at that moment
+leaves half a file, of which every later process warns, and which none replaces.
 """
 
 import functools
@@ -44,7 +50,7 @@ def use_default() -> None:
 
     Warns, and has nothing kept, where that folder belongs to somebody else or cannot be made:
     JAX would run what it finds there. In any folder, JAX then writes its files completely or not
-    at all (`compiled_programs`).
+    at all (`write_complete_files`).
     """
     write_complete_files()
     if setting(FOLDER) is not None:

@@ -2,6 +2,12 @@
 
 Dask schedules them, notices workers that die, and gives their calls to others. Workers of this
 machine are spawned, never forked: a fork of a process in which JAX has started may hang.
+
+One process compiles what several need; the others of this machine wait until it is kept.
+
+Processes that share a cache of programs would all compile the same ones if they began at once.
+Which programs a process has kept is noted beside them, so that later ones need not wait. A lock
+ends with its process, also a killed one.
 """
 
 import functools

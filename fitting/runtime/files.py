@@ -5,6 +5,12 @@ it is the file that it leads to which is written, and the link stays. What kille
 processes have left under such names is removed when the next file is written in the same folder.
 Names by 0.1.0 do not say which process it was: those go when the same file is written again, if
 they are old.
+
+HDF5 files with a checksum behind their last byte, which HDF5 itself ignores.
+
+HDF5 ends the process with a segmentation fault where some bytes of a file are damaged, or where
+the disk is full while it writes. So a file is made in memory, and is checked before HDF5 opens it.
+A program that changes the file drops the seal, and then it is not checked.
 """
 
 import contextlib

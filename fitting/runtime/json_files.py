@@ -2,6 +2,13 @@
 
 A file without a version is one of a release before there were versions. What it has is checked in
 the same way; what it must have, its kind says.
+
+Values that a file held, checked against the type that a `TypedDict` or a dataclass declares.
+
+The declaration says what is written; here it also says what is accepted when it is read again.
+`Annotated[float, constraint]` narrows a type by a `Constraint` of `runtime.validation`;
+`Annotated[Content, SomeClass]` is a table with the fields of a dataclass, and no others; a field
+may have metadata that say by which name earlier releases wrote it.
 """
 
 import dataclasses

@@ -1,8 +1,19 @@
 """Traced programs kept on disk beside the compiled ones, so that the next process need not trace.
 
 JAX's own cache finds compiled code by the text of a program, and has to trace to get that text; for
-a fit, tracing takes longer than the search. Here the text itself is kept, in a `program_file` that
-is named after its `program_key`.
+a fit, tracing takes longer than the search. Here the text itself is kept, in a file that is
+named after its `program_key`.
+
+Files of traced programs.
+
+    jaxik program 1                  format and its version, in a line
+    {"key": ..., "versions": ...}    header, JSON in a line
+    ...                              `jax.export`'s own serialisation of the program
+
+The header holds `key`, which stands for all that the program is traced from; `versions` of Python
+and of the libraries; `output`, the structure of the output as `plain_tree` writes it, with a `Slot`
+for each array; `sha256` of what follows the header. A file is read only if all of them are as
+expected, and if it belongs to the user who runs the program.
 """
 
 import dataclasses

@@ -69,7 +69,8 @@ def configure_xla() -> None:
 
     Programs also run in the thread that calls them, unless `JAX_CPU_ENABLE_ASYNC_DISPATCH` says
     otherwise: waking another thread, as JAX does by default, takes as long as computing one frame
-    of one character. And memory of arrays that were freed is kept for new ones (`allocator`).
+    of one character. And memory of arrays that were freed is kept for new ones
+    (`keep_freed_memory`).
     """
     import jax  # takes half a second, which `jaxik --help` should not spend
 

@@ -1,4 +1,12 @@
-"""A flat animation on a terrain, and what a system makes of it."""
+"""A flat animation on a terrain, and what a system makes of it.
+
+How much the motion of a system depends on the frame rate at which it runs.
+
+Of an animation every second, third or so frame is played, as in a game that draws fewer frames, and
+the motion is compared with that of all frames where both have one. What the animation says of
+itself, its strides, contact labels and speeds, stays as it is at the animation's own rate: a game
+keeps it with the asset.
+"""
 
 import dataclasses
 import json

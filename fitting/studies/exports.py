@@ -1,4 +1,9 @@
-"""The job that writes parameters for others: as files of ours, the game's record, or settings."""
+"""The job that writes parameters for others: as files of ours, the game's record, or settings.
+
+The experiments that come with the package, and copies of them with all of their files.
+
+They lie in the folder `data` of the repository. A wheel has them in `fitting/examples`.
+"""
 
 import os
 import tomllib

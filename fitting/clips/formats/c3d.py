@@ -9,6 +9,12 @@ the centres of the markers for the bone below them.
 Knees and ankles lie where Davis' chord function puts them: in the plane of the joint above, the
 marker on the joint and the marker on the wand or segment, half a joint's width and the radius of a
 marker inwards, with a right angle at the joint.
+
+Joints with their rotations, from markers that a joint map or Plug-in Gait names.
+
+Positions are joint centres. Rotations are what positions and further markers show: the pelvis'
+from three of its markers, or else from hips and thighs; thigh and shin as in `leg_geometry`; the
+foot's from ankle, heel and toe, or else from the foot and the hinge of the knee.
 """
 
 from collections.abc import Mapping, Sequence

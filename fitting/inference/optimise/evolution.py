@@ -11,6 +11,16 @@ jitter     one or two smooth parameters, up to 30 times as far as the data leave
 
 The most promising come again after a Gauss-Newton step, since other decisions need other smooth
 parameters. After some generations the best one descends; rounds of both go on while they gain.
+
+The costs of many candidates at once.
+
+Costs are computed with 32-bit floats, side by side in the lanes of vector registers: a quarter of
+the time that 64 bits take under `jax.vmap`. They differ by about a millionth of themselves, which
+ranks candidates well enough; where one is adopted, a descent computes its cost anew.
+
+Sweeps: each parameter carried over its whole range, to leave the valleys of single parameters.
+
+A clamp that is never reached has no derivative to follow, and neither has a threshold.
 """
 
 import dataclasses

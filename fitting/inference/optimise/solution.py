@@ -1,4 +1,11 @@
-"""What a search reports while it runs, and its result."""
+"""What a search reports while it runs, and its result.
+
+What the stages of a search hand on to each other.
+
+Every stage is a function `(search, state, ...) -> state`. A `Search` is what stays the same, a
+`SearchState` what changes. Stages change neither: called again with the same state they do the
+same.
+"""
 
 import copy
 import dataclasses

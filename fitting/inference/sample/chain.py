@@ -5,8 +5,13 @@ and changes it in place: 4 of 24 kills between two of its writes left a file tha
 Here a finished step is one record appended to a journal beside the HDF5 file, in one write and with
 a checksum. A kill can only tear the last record, which is then dropped.
 
-From time to time `save` writes the whole chain to a new HDF5 file (`chain_file`), replaces the old
+From time to time `save` writes the whole chain to a new HDF5 file (`write_chain`), replaces the old
 one atomically and empties the journal. Steps that are in both are recognised by their number.
+
+The HDF5 file of a chain: what is written, and what is accepted when it is read again.
+
+It has the layout of emcee's backend (3.1.6), which can read it, and in its attributes the format
+and the identity of the run.
 """
 
 import dataclasses

@@ -2,6 +2,16 @@
 
 No value of the fitted parameters is true, then. What a fit says of its motion still must be: on
 frames that were held out, against the capture and against the motion that has no errors.
+
+Errors as captures have them: slow, constant, sudden, and of people who are no system.
+
+None of them is the noise that a fit assumes, which is independent of frame and joint.
+
+Nobody sees differences as small as `UNSEEN`. So a verdict is true unless it is contradicted by
+more: one that says "fits" where the motion without errors is further off than what looks the same,
+or where the fit has made something worse; "worse" where the distance that it names is not larger
+than the other one there; "does not fit", which is said of the capture, where this is clearly within
+without its noise and jumps.
 """
 
 import copy

@@ -2,6 +2,14 @@
 
 runs/EXPERIMENT/CLIP/seed_0   where a clip is fitted alone
 runs/EXPERIMENT/seed_0        where the clips of an experiment are fitted together
+
+The row of a fit: what the table of many fits says of it, kept in its run folder.
+
+The file is the last that is written there: a folder that has it is whole.
+
+The table of many fits: a row for each, as CSV and, with pyarrow, as Parquet.
+
+Parameters of different experiments share the table: what a fit has not is empty.
 """
 
 import csv

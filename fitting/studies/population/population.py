@@ -2,6 +2,12 @@
 
 Each search has a file that is named after what it follows from. So an interrupted study continues:
 called again, it finds what it had, and the search that was running goes on after its last stage.
+
+Searches whose results are kept on disk, each in a file that is named after what it follows from.
+
+An interrupted study continues: called again, it finds what it had, and the search that was running
+goes on after its last stage. A search of another problem, with other settings or another seed has
+another name.
 """
 
 import dataclasses
