@@ -4,6 +4,7 @@ JAX fails at some values long after it was imported, and XLA ends the process at
 refused here, in a line. Settings for debugging under which no command can work are switched off.
 """
 
+import functools
 import os
 import re
 import subprocess
@@ -61,6 +62,7 @@ def about_variable(error: Exception) -> StartError | None:
     return None
 
 
+@functools.cache  # a process may run many commands
 def _check_flags(flags: str) -> None:
     """Raises StartError for flags at which XLA would end the process; another one tries them."""
     command = [sys.executable, "-P", "-c", PARSED]
