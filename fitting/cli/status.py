@@ -23,8 +23,10 @@ def of_job(*, interrupted: bool) -> int:
 
 def of_fit(fitted: "Fit") -> int:
     """The exit status of a search; what a translation leaves over is a result, and no failure."""
+    from fitting.studies.fit.sentences import is_worse
+
     of_job(interrupted=fitted.solution.interrupted)
-    if fitted.has_noise and fitted.distances.setbacks:
+    if is_worse(fitted):
         return WORSE
     if not fitted.solution.converged:
         return NOT_CONVERGED

@@ -32,10 +32,10 @@ def is_worse(fitted: Fit) -> bool:
 
 def verdict_word(fitted: Fit) -> str:
     """The verdict in two or three words."""
-    if not fitted.summary["converged"]:
-        return "Not converged"
     if is_worse(fitted):
         return "Worse"
+    if not fitted.summary["converged"]:
+        return "Not converged"
     if fitted.has_noise:
         return "Fits" if fitted.verdict.fits else "Does not fit"
     return "The same motion" if fitted.verdict.fits else "Not the same motion"
