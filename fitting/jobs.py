@@ -1,9 +1,8 @@
 """Whole jobs, from files to a folder with results and a report: what the command line runs.
 
 Each job checks everything the user gave before it computes anything, writes its results as soon as
-they exist, and draws its report last. Without an `output` nothing is written. `progress` is called
-with reports of a running search or sampling; `log` with lines and tables as the command line prints
-them, so `log=print` shows the same.
+they exist, and draws its report last. Without an `output` nothing is written. How a job gets on,
+and the lines and tables that the command line prints, go to whoever watches: `runtime.activity`.
 
 Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
 bits; a system that was made in 32 bits is taken with the values it has there.
@@ -25,7 +24,6 @@ from .studies.fit.fit_jobs import fit as fit
 from .studies.fit.fit_jobs import sample as sample
 from .studies.fit.fit_jobs import translate as translate
 from .studies.many.fit_many import fit_many as fit_many
-from .studies.output import Log as Log
 from .studies.population.population_report import population as population
 from .studies.sample.run_comparison import compare_runs as compare_runs
 from .viewer.views import view as view

@@ -26,10 +26,11 @@ from matplotlib.figure import Figure
 import fitting
 import jaxik
 from fitting import jobs
-from fitting.cli import main, progress
+from fitting.cli import main
 from fitting.experiment import problems
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.optimise import search
+from fitting.inference.optimise.solution import Report
 from fitting.inference.profiles import profiling
 from fitting.inference.sample import posterior
 from fitting.inference.sample.posterior import Posterior
@@ -42,7 +43,7 @@ from fitting.studies.sample import posterior_report, replay
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import CLIP, ROOT, write
-from support.watching import Recorder
+from support.watching import Recorder, listening
 
 NAME = r"../../elsewhere $\frac{$"  # no path, and no formula
 TOP = f"name = '{NAME}'"
@@ -147,7 +148,8 @@ def done(tmp_path_factory) -> Done:
     run, sampled = folder / "run", tmp_path_factory.mktemp("sampled") / "run"
     jax.clear_caches()  # what other tests compiled with other options rounds differently
     with jax.enable_x64(False):
-        fitted, of_fit = watched(lambda: fitting.fit(experiment, run, log=log.append))
+        with listening(log.append):
+            fitted, of_fit = watched(lambda: fitting.fit(experiment, run))
         shutil.copytree(run, sampled)
         drawn, of_sampling = watched(lambda: fitting.sample(sampled))
     return Done(experiment, fitted, run, drawn, sampled, log, (of_fit, of_sampling))
@@ -227,7 +229,8 @@ def worsen(run: Path) -> dict[str, Any]:
 def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(done, run):
     worsen(run)
     lines: list[str] = []
-    sampled = fitting.sample(run, log=lines.append)
+    with listening(lines.append):
+        sampled = fitting.sample(run)
     assert any("lower than the fit's; the fit goes on from there" in line for line in lines)
     _, adopted = run_folder.load_fit(run)
     for before, after in zip(done.fitted.parameters, adopted["parameters"], strict=True):
@@ -352,7 +355,7 @@ def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
     run = tmp_path / "run"
     words = ["fit", str(done.experiment), "-o", str(run)]
     with monkeypatch.context() as patch:
-        patch.setattr(progress, "fit_line", interrupt)
+        patch.setattr(Report, "__str__", interrupt)
         assert main.main(words) == main.INTERRUPTED == 130
     numbers = numbers_of(run)
     assert numbers["message"].startswith("Interrupted after 0 steps") and not numbers["converged"]
@@ -403,7 +406,7 @@ def test_sampling_continues_its_chain(done, run, capsys):
 
 
 def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
-    monkeypatch.setattr(progress, "sample_line", interrupt)
+    monkeypatch.setattr(posterior.SamplingProgress, "__str__", interrupt)
     assert main.main(["sample", str(run), "--max-steps", "300"]) == main.INTERRUPTED
     output = capsys.readouterr().out
     assert "interrupted; summarising and writing the chain" in output

@@ -3,12 +3,6 @@
 `python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
 folder, as a command or a notebook would, and prints the seconds until the first number and until
 the end.
-
-What a newcomer waits for: a first fit, a first posterior, the first cells of a notebook.
-
-`python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
-folder, as a command or a notebook would, and prints the seconds until the first number and until
-the end.
 """
 
 import json
@@ -18,9 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from fitting.runtime import activity
 
 from .measurement import FigureSpec, Measurement
 from .workloads import Sizes
@@ -69,23 +63,23 @@ def _in_process(kind: str, folder: Path, variables: dict[str, str]) -> dict[str,
     return {"first": first - start, "end": time.time() - start}
 
 
-def fit(folder: Path, reached: Callable[..., Any]) -> None:
+def fit(folder: Path) -> None:
     """The whole job; its first number is a cost."""
     import fitting
 
     shutil.rmtree(folder / RUN, ignore_errors=True)
-    fitting.fit(folder / f"{EXAMPLE}.toml", folder / RUN, progress=reached)
+    fitting.fit(folder / f"{EXAMPLE}.toml", folder / RUN)
 
 
-def sample(folder: Path, reached: Callable[..., Any]) -> None:
+def sample(folder: Path) -> None:
     """Steps around the fit that is there until the first report on the chain."""
     import fitting
     from fitting.inference.sample.blocks import SamplerSettings
 
-    fitting.sample(folder / RUN, max_steps=SamplerSettings().check_every, progress=reached)
+    fitting.sample(folder / RUN, max_steps=SamplerSettings().check_every)
 
 
-def notebook(folder: Path, reached: Callable[..., Any]) -> None:
+def notebook(folder: Path) -> None:
     """What a notebook begins with: a clip on its ground, a preset, how high the feet are."""
     import jaxik
     from fitting.experiment.experiment_files import load_experiment
@@ -95,7 +89,18 @@ def notebook(folder: Path, reached: Callable[..., Any]) -> None:
     problem = make_problem(load_experiment(folder / f"{EXAMPLE}.toml"))
     (scene,) = problem.data
     result = playback.run(jaxik.presets.record(), scene)
-    reached(float(result.pose.ankle.pos[..., 1].mean()))
+    activity.report(float(result.pose.ankle.pos[..., 1].mean()))
+
+
+class _Clock(activity.Watcher):
+    """Notes when numbers come, in seconds since 1970."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def reported(self, result: object) -> None:
+        if not isinstance(result, tuple):  # `Loaded`, before the search
+            self.times.append(time.time())
 
 
 def main() -> None:
@@ -104,10 +109,10 @@ def main() -> None:
 
     xla.configure_xla()
     cache_folder.use_default()
-    times: list[float] = []
     jobs = {"fit": fit, "sample": sample, "notebook": notebook}
-    jobs[sys.argv[1]](Path(sys.argv[2]), lambda *_: times.append(time.time()))
-    print(f"\n{times[0]}")
+    with activity.watched_by(clock := _Clock()):
+        jobs[sys.argv[1]](Path(sys.argv[2]))
+    print(f"\n{clock.times[0]}")
 
 
 if __name__ == "__main__":

@@ -103,9 +103,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
     descents: dict[str, kernels.Descent] = {}
 
     def ours() -> None:
-        solution = find_best_fit(
-            problem, progress=lambda now: measurement.progress(f"fit: {now.stage}")
-        )
+        solution = find_best_fit(problem)
         if solution.interrupted:  # the search keeps Ctrl-C to itself; half a run is no figure
             raise KeyboardInterrupt
         solutions.append(solution)
@@ -159,9 +157,6 @@ def posterior(measurement: Measurement, sizes: Sizes) -> None:
         sampled = sample_posterior(
             problem, WalkerStart(centre, sd),
             SamplerSettings(walkers=sizes.walkers, max_steps=steps, stop_at=1e9),
-            progress=lambda now: measurement.progress(
-                f"posterior: step {now.step} of {now.max_steps}"
-            ),
         )  # fmt: skip
         if sampled.interrupted:
             raise KeyboardInterrupt

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from fitting.runtime import cache_folder, xla
+from fitting.runtime import activity, cache_folder, xla
 from fitting.runtime.threads import usable_cores
 
 from .roofline import Work, lower_bound, work_of_program
@@ -124,10 +124,6 @@ class Series:
         return float(np.polyfit(sizes, seconds, 1)[0]) if len(sizes) > 1 else float("nan")
 
 
-def _ignore(text: str) -> None:
-    pass
-
-
 @dataclass
 class Measurement:
     """What one benchmark measures. Samples, CPU times and work are those of one call, by name."""
@@ -137,8 +133,6 @@ class Measurement:
     repeats: int
     floats: str = ""
     """Float32 or float64; empty where figures say it, or there are none."""
-    progress: Callable[[str], None] = _ignore
-    """Called with what is being done."""
     ceilings: dict[str, float] = field(default_factory=dict)
     """See `roofline.lower_bound`."""
     figures: list[Figure] = field(default_factory=list)
@@ -156,6 +150,10 @@ class Measurement:
     """Load average at the start."""
     seconds: float = 0.0
     """Duration of the whole benchmark."""
+
+    def progress(self, text: str) -> None:
+        """Says what is being done."""
+        activity.report(text, text)
 
     def compile(
         self, name: str, function: Callable, *arguments: PyTree, sparse: PyTree = ()
@@ -380,7 +378,6 @@ def run_benchmarks(
     sizes: Sizes,
     quick: bool,
     announce: Callable[[str], None],
-    progress: Callable[[str], None] = lambda text: None,
 ) -> Report:
     """Measures benchmarks one after another; an interrupt ends it and keeps what was measured.
 
@@ -389,7 +386,6 @@ def run_benchmarks(
         sizes: of the workloads.
         quick: whether these are the small sizes, for the report.
         announce: called with a line at the start and at the end of each benchmark.
-        progress: called with what is being done within a benchmark.
     """
     report, ceilings = Report(quick), {}
     cached = cache_folder.setting(cache_folder.ENABLED)
@@ -399,7 +395,7 @@ def run_benchmarks(
         for number, (name, benchmark) in enumerate(benchmarks.items()):
             announce(f"[{number + 1}/{len(benchmarks)}] {name}: {benchmark.title}")
             measurement = Measurement(
-                name, benchmark.title, sizes.repeats, benchmark.floats, progress, ceilings,
+                name, benchmark.title, sizes.repeats, benchmark.floats, ceilings,
                 load=load_average(),
             )  # fmt: skip
             report.measurements.append(measurement)

@@ -51,7 +51,7 @@ def _numbers(measurement: Measurement) -> dict[str, object]:
     plain = {
         field.name: getattr(measurement, field.name)
         for field in dataclasses.fields(measurement)
-        if field.name not in ("progress", "figures", "series", "work")
+        if field.name not in ("figures", "series", "work")
     }
     figures = [
         dataclasses.asdict(figure) | {"met": figure.met, "closeness": figure.closeness}

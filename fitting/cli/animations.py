@@ -5,8 +5,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fitting.runtime import activity
-
 from . import status
 from .options import (
     ADDRESS,
@@ -24,7 +22,6 @@ from .options import (
     rates,
     terrain_options,
 )
-from .terminal import show
 
 if TYPE_CHECKING:
     from fitting.studies.animations import AnimationFiles
@@ -107,7 +104,7 @@ def apply(options: argparse.Namespace) -> int:
 
     jobs.apply(
         options.run, _animation(options), options.output,
-        with_terrain=options.with_terrain, log=show,
+        with_terrain=options.with_terrain,
     )  # fmt: skip
     return 0
 
@@ -134,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
         ik, _ = parameter_files.load_system(options.parameters, rig)
     else:
         ik = systems.preset_system(options.preset, rig)
-    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=show)
+    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain)
     return 0
 
 
@@ -170,7 +167,7 @@ def view(options: argparse.Namespace) -> int:
     address = Address(options.host, options.port)
     if options.terrain is None:
         _check_run(options)
-        jobs.view_run(options.clip, options.output, address, log=show)
+        jobs.view_run(options.clip, options.output, address)
         return 0
     folder = options.output or Path()
     check_folder(folder)
@@ -178,7 +175,7 @@ def view(options: argparse.Namespace) -> int:
     if options.parameters is not None:
         given, preset = load_system(options.parameters, animation.flat_clip.rig)
     subject = viewer.subject_of_animation(animation, preset, given)
-    jobs.view(subject, folder, address, log=show)
+    jobs.view(subject, folder, address)
     return 0
 
 
@@ -255,8 +252,6 @@ def compare(options: argparse.Namespace) -> int:
         animation,
         options.output,
         rates=options.rates,
-        during=lambda name: activity.announced(f"Compiling and running {name}"),
-        log=show,
     )
     return 0
 
@@ -280,9 +275,7 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     def systems_of(rig: Rig) -> dict[str, FootIK]:
         return named_systems(requested, rig)
 
-    total = len(plan.situations)
-    with activity.announced(f"Running {total} situations", total) as work:
-        finished = jobs.run_suite(systems_of, plan, options.output, during=work.part, log=show)
+    finished = jobs.run_suite(systems_of, plan, options.output)
     return status.of_job(interrupted=finished.interrupted)
 
 
@@ -294,7 +287,7 @@ def _compare_runs(options: argparse.Namespace) -> int:
     _check_unused(options, own, "runs are compared on the clips of their fits")
     if options.systems:
         raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")
-    jobs.compare_runs(options.runs.split(","), options.output, log=show)
+    jobs.compare_runs(options.runs.split(","), options.output)
     return 0
 
 

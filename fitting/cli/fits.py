@@ -2,9 +2,12 @@
 
 import argparse
 import functools
+from contextlib import ExitStack
 from pathlib import Path
 
-from . import progress, status
+from fitting.runtime import activity
+
+from . import status
 from .options import (
     ADDRESS,
     CLIP_OPTIONS,
@@ -21,7 +24,7 @@ from .options import (
     rate,
     terrain_options,
 )
-from .terminal import show
+from .progress import interruptible
 
 EXPERIMENT = argument(
     "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
@@ -84,7 +87,7 @@ def init(options: argparse.Namespace) -> int:
         reading=clip_options(options),
         terrain_reading=terrain_options(options),
     )
-    jobs.init(request, options.output, log=show)
+    jobs.init(request, options.output)
     return 0
 
 
@@ -122,16 +125,11 @@ def fit(options: argparse.Namespace) -> int:
     experiment = load_experiment(options.experiment)
     if options.record_only and not experiment.record_only:
         experiment = restrict(experiment)
-    if not options.view:
-        with progress.ProgressLine(progress.fit_line) as line:
-            fitted = jobs.fit(experiment, options.output, progress=line, log=show)
-        return status.of_fit(fitted)
-    address = Address(options.host, options.port)
-    with (
-        progress.ProgressLine(progress.fit_line) as line,
-        FitWatch(options.output, address, line, show) as watch,
-    ):
-        fitted = jobs.fit(experiment, options.output, progress=watch, log=show, loaded=watch.load)
+    with interruptible(), ExitStack() as stack:
+        if options.view:
+            watch = FitWatch(options.output, Address(options.host, options.port))
+            stack.enter_context(activity.watched_by(stack.enter_context(watch)))
+        fitted = jobs.fit(experiment, options.output)
     return status.of_fit(fitted)
 
 
@@ -154,10 +152,8 @@ def ablate(options: argparse.Namespace) -> int:
     """
     from fitting import jobs
 
-    with progress.ProgressLine(progress.fit_line) as line:
-        jobs.ablate(
-            options.experiment, options.output, folds=options.folds, progress=line, log=show
-        )
+    with interruptible():
+        jobs.ablate(options.experiment, options.output, folds=options.folds)
     return 0
 
 
@@ -204,7 +200,7 @@ def calibrate(options: argparse.Namespace) -> int:
             "--chains ranks true values among a posterior's, and under another system than the "
             "experiment's none is true; leave --chains or --truth out"
         )
-    with progress.ProgressLine(progress.calibration_line) as line:
+    with interruptible():
         job = (
             functools.partial(jobs.calibrate, chains=options.chains)
             if options.truth is None
@@ -217,8 +213,6 @@ def calibrate(options: argparse.Namespace) -> int:
             noise_factor=options.noise_factor,
             workers=options.workers,
             scheduler=options.scheduler,
-            progress=line,
-            log=show,
         )
     return 0 if assessment.inside else status.OUTSIDE
 
@@ -240,8 +234,8 @@ def population(options: argparse.Namespace) -> int:
     """
     from fitting import jobs
 
-    with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.population(options.experiment, options.output, progress=line, log=show)
+    with interruptible():
+        fitted = jobs.population(options.experiment, options.output)
     return 0 if fitted.converged else status.NOT_CONVERGED
 
 
@@ -295,7 +289,6 @@ def fit_many(options: argparse.Namespace) -> int:
         report=options.reports,
         workers=options.workers,
         scheduler=options.scheduler,
-        log=show,
     )
     return status.of_many(fits)
 
@@ -318,8 +311,8 @@ def sample(options: argparse.Namespace) -> int:
     """
     from fitting import jobs
 
-    with progress.ProgressLine(progress.sample_line) as line:
-        posterior = jobs.sample(options.run, max_steps=options.max_steps, progress=line, log=show)
+    with interruptible():
+        posterior = jobs.sample(options.run, max_steps=options.max_steps)
     return status.of_job(interrupted=posterior.interrupted)
 
 
@@ -388,6 +381,6 @@ def translate(options: argparse.Namespace) -> int:
     target = load_named_system(options.target, "--to", rig)
     free = None if options.free is None else read_free(options.free, target.ik, rig)
     request = TranslationRequest(source, target, animations, free, options.fps)
-    with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.translate(request, options.output, progress=line, log=show)
+    with interruptible():
+        fitted = jobs.translate(request, options.output)
     return status.of_fit(fitted)

@@ -9,8 +9,9 @@ from pathlib import Path
 from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
-from . import progress, status
+from . import status
 from .options import argument, command, flag
+from .progress import interruptible
 from .terminal import show
 
 SHELLS = ("bash", "zsh", "tcsh", "fish", "powershell")  # that shtab knows
@@ -38,8 +39,8 @@ def bench(options: argparse.Namespace) -> int:
     plot = report.check_output_files(options.json, options.plot)
     sizes = QUICK if options.quick else FULL
     title = f"Running {len(chosen)} benchmarks"
-    with activity.announced(title), progress.ProgressLine(str) as line:
-        measured = measurement.run_benchmarks(chosen, sizes, options.quick, _print_line, line)
+    with activity.announced(title), interruptible():
+        measured = measurement.run_benchmarks(chosen, sizes, options.quick, _print_line)
     written = report.write(measured, options.json, plot)
     show(report.text(measured))
     for path in written:

@@ -34,7 +34,8 @@ def watched() -> Iterator[None]:
     # Where results go to a terminal, too, it is the same one, and one console keeps them apart.
     console = None
     if sys.stderr is None:  # it was closed
-        yield
+        with activity.watched_by(Shown()):
+            yield
         return
     if make_console(sys.stderr) is not None:
         console = make_console(sys.stdout) or make_console(sys.stderr)
@@ -117,7 +118,15 @@ def show_help(text: str) -> None:
     draw_help(console, text)
 
 
-class PlainLines:
+class Shown(activity.Watcher):
+    """Prints what is logged, and shows nothing of work."""
+
+    def logged(self, text: str) -> None:
+        """Called with a line or a table."""
+        show(text)
+
+
+class PlainLines(Shown):
     """Announces work that takes longer than a moment, and reports on it now and then.
 
     Work within other work that has been announced once under the same title is only reported on: a

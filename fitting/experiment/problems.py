@@ -5,7 +5,7 @@ they belong together.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -57,35 +57,19 @@ class ClipData(NamedTuple):
     """Parameters that change along the base, (frames, ...) by dotted name."""
 
 
-def _silent(text: str) -> None:
-    """Drops a line of the log."""
-
-
 @in_float64
-def make_problem(
-    experiment: Experiment, log: Callable[[str], object] = _silent
-) -> Problem[jaxik.FootIK]:
+def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
     """Loads the clips of an experiment and builds its problem.
-
-    Args:
-        experiment: what is fitted to what.
-        log: called with lines for each clip: where its root is, and what was guessed or is odd.
 
     Raises:
         ValueError: something in the experiment does not fit its clips or its preset.
     """
-    return problem_from_clips(experiment, load_clips(experiment, log))
+    return problem_from_clips(experiment, load_clips(experiment))
 
 
 @in_float64
-def load_clips(
-    experiment: Experiment, log: Callable[[str], object] = _silent
-) -> tuple[ClipData, ...]:
+def load_clips(experiment: Experiment) -> tuple[ClipData, ...]:
     """Loads the clips of an experiment, in the order of its entries.
-
-    Args:
-        experiment: what is fitted to what.
-        log: called with lines on each clip: where its root is, jumps, and what was guessed.
 
     Raises:
         ValueError: a file cannot be read, or does not fit the others of its clip.
@@ -100,15 +84,19 @@ def load_clips(
         for entry in experiment.placed_clips():
             data.append(load_clip_data(entry, experiment.fps))
             reading.advance()
-    for clip in data:
-        log(f"root of {clip.base.source}: {clip.root.reason}")
+    return tuple(data)
+
+
+def remarks(clips: Iterable[ClipData]) -> Iterator[str]:
+    """Lines on each clip: where its root is, jumps, and what was guessed or is odd."""
+    for clip in clips:
+        yield f"root of {clip.base.source}: {clip.root.reason}"
         if in_the_air := flight.describe(clip.base):
-            log(f"{clip.base.source}: {in_the_air}")
+            yield f"{clip.base.source}: {in_the_air}"
         both = (clip.reference, clip.base)
         notes = dict.fromkeys((file.source, remark) for file in both for remark in file.remarks)
         for source, remark in notes:
-            log(f"note on {source}: {remark}")
-    return tuple(data)
+            yield f"note on {source}: {remark}"
 
 
 def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Problem[jaxik.FootIK]:

@@ -26,7 +26,7 @@ and finite, at 0; with flat priors this is restricted maximum likelihood (REML).
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,6 +37,7 @@ from scipy import linalg, optimize
 
 from fitting.problem.problem import Problem
 from fitting.problem.space import Prior, Space, Vector
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from .noise import information_of_slopes
@@ -490,12 +491,21 @@ class PopulationFit:
         return predicted
 
 
+class Round(NamedTuple):
+    """One report of a running fit."""
+
+    number: int
+    cost: float
+
+    def __str__(self) -> str:
+        return f"round {self.number}  cost {self.cost:.6g}"
+
+
 @in_float64
 def fit_population(
     problems: Sequence[Problem],
     grouping: Grouping,
     starts: Sequence[Points],
-    progress: Callable[[int, float], None] = lambda rounds, cost: None,
 ) -> PopulationFit:
     """The most probable of the modes that the starts lead to.
 
@@ -503,7 +513,6 @@ def fit_population(
         problems: of one clip each, with the same free parameters and prior.
         grouping: of the clips, for each free parameter; thresholds are shared.
         starts: of all clips, in u; thresholds are held at the values of the first one's first clip.
-        progress: called after each round with its number and the cost.
 
     Raises:
         ValueError: a threshold is not shared; residuals or derivatives are not finite at a start.
@@ -513,7 +522,7 @@ def fit_population(
     smooth = np.asarray(space.smooth)
     held = np.where(smooth, 0.0, starts[0][0])
     fits = [
-        _Search(problems, space, grouping, smooth, progress).run(np.where(smooth, start, held))
+        _Search(problems, space, grouping, smooth).run(np.where(smooth, start, held))
         for start in starts
     ]
     return max(fits, key=lambda fit: fit.log_probability)
@@ -573,7 +582,6 @@ class _Search:
     space: Space
     grouping: Grouping
     smooth: Bool[np.ndarray, " free"]
-    progress: Callable[[int, float], None]
 
     def run(self, start: Points) -> PopulationFit:
         """The mode that a start leads to."""
@@ -594,7 +602,8 @@ class _Search:
             if after is state:
                 break
             state = after
-            self.progress(rounds, float(state.likelihoods.cost.sum()))
+            reached = Round(rounds, float(state.likelihoods.cost.sum()))
+            activity.report(reached, str(reached))
         return self._finished(state, rounds, converged=False)
 
     def _finished(self, state: _State, rounds: int, *, converged: bool) -> PopulationFit:

@@ -15,7 +15,7 @@ density is that of the loss: normal, Student's t, or the one whose logarithm a r
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -40,7 +40,7 @@ from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
 from .optimise.search import cost_before, refine
-from .optimise.solution import DEFAULTS, Progress, SearchSettings, Solution
+from .optimise.solution import DEFAULTS, SearchSettings, Solution
 
 Sigmas = Literal["given", "estimated"]
 Correlation = Literal["given", "whitened", "counted"]
@@ -559,7 +559,6 @@ def fit_with_noise(
     options: NoiseOptions,
     solution: Solution,
     settings: SearchSettings = DEFAULTS,
-    progress: Callable[[Progress], None] | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that is likeliest there, and the problem with this noise.
 
@@ -573,7 +572,6 @@ def fit_with_noise(
         options: what of it is estimated; nothing leaves the solution as it is.
         solution: of the problem.
         settings: of the descents.
-        progress: called as they go on.
     """
     if not options.moves_optimum:
         return problem, solution
@@ -585,6 +583,6 @@ def fit_with_noise(
         if noise.change_from(noise_of(problem)) < JOINT_TOLERANCE:
             break
         problem = with_noise(problem, noise)
-        solution = refine(problem, solution, solution.u, settings, progress)
+        solution = refine(problem, solution, solution.u, settings)
         solution = dataclasses.replace(solution, cost_before=cost_before(problem))
     return problem, solution

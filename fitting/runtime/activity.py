@@ -1,33 +1,38 @@
-"""What a program is busy with: long work announces itself here, and whoever watches shows it.
+"""What a program is busy with and what it has found: long work says so here, and watchers listen.
 
 ```python
 with activity.announced("Drawing pictures", total=len(plots)) as work:
     for plot in plots:
         draw(plot)
         work.advance()
+
+class Printer(activity.Watcher):
+    def logged(self, text):
+        print(text)
+
+with activity.watched_by(Printer()):
+    fitting.fit("walk.toml")
 ```
 
 A title says what is done and to how much of it; it is announced before the work begins. Without a
-watcher nothing happens. The command line watches; so may any program, with `watched_by`. Work in
-other threads and processes is not seen.
+watcher nothing happens. The command line watches; so may any program. Work in other processes is
+not seen; in another thread it is where `threads.for_other_thread` carries the context there.
 """
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Protocol, runtime_checkable
+from typing import TypeVar
+
+Value = TypeVar("Value")
 
 
 class Work:
     """Something that takes long, while it is going on."""
 
     def __init__(
-        self,
-        title: str,
-        total: int | None = None,
-        watcher: "Watcher | None" = None,
-        done: int = 0,
+        self, title: str, total: int | None, watchers: "tuple[Watcher, ...]", done: int = 0
     ):
         self.title = title
         self.total = total
@@ -40,7 +45,7 @@ class Work:
         self._compiling: dict[str, float] = {}
         self.failed = False
         self.began = time.monotonic()
-        self._watcher = watcher
+        self._watchers = watchers
 
     @property
     def seconds(self) -> float:
@@ -92,9 +97,9 @@ class Work:
         self.changed()
 
     def changed(self) -> None:
-        """Tells the watcher of a new count or note."""
-        if self._watcher is not None:
-            self._watcher.changed(self)
+        """Tells the watchers of a new count or note."""
+        for watcher in self._watchers:
+            watcher.changed(self)
 
     @contextmanager
     def part(self, title: str) -> Iterator["Work"]:
@@ -104,35 +109,42 @@ class Work:
         self.advance()
 
 
-@runtime_checkable
-class Watcher(Protocol):
+class Watcher:
     """Is told of all work, in the thread that does it; work within other work ends before it."""
 
     def began(self, work: Work) -> None:
         """Called before the work begins."""
-        ...
 
     def changed(self, work: Work) -> None:
         """Called with a new count or note."""
-        ...
 
     def ended(self, work: Work) -> None:
         """Called when it is done, or has failed."""
-        ...
+
+    def logged(self, text: str) -> None:
+        """Called with a line or a table, as the command line prints it."""
+
+    def reported(self, result: object) -> None:
+        """Called with a result on the way: a step of a search, a state of a chain, a new row."""
 
 
-_watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
+_watchers: ContextVar[tuple[Watcher, ...]] = ContextVar("watchers", default=())
 _innermost: ContextVar[Work | None] = ContextVar("innermost", default=None)
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
 
 
 @contextmanager
-def watched_by(watcher: Watcher | None) -> Iterator[None]:
-    """Tells a watcher of all work that is done in this context; None tells nobody."""
-    token = _watcher.set(watcher)
-    try:
+def watched_by(watcher: Watcher) -> Iterator[None]:
+    """Tells a watcher, after those there are, of all work that is done in this context."""
+    with _set(_watchers, (*_watchers.get(), watcher)):
         yield
-    finally:
-        _watcher.reset(token)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps what is logged in this context from all watchers: a job within another one."""
+    with _set(_quiet, True):
+        yield
 
 
 @contextmanager
@@ -144,20 +156,19 @@ def announced(title: str, total: int | None = None, *, done: int = 0) -> Iterato
         total: how many parts it has, or has at most.
         done: how many of them were done before.
     """
-    watcher = _watcher.get()
-    work = Work(title, total, watcher, done)
-    token = _innermost.set(work)
-    try:
-        if watcher is not None:
-            watcher.began(work)
-        yield work
-    except BaseException:
-        work.failed = True
-        raise
-    finally:
-        _innermost.reset(token)
-        if watcher is not None:
-            watcher.ended(work)
+    watchers = _watchers.get()
+    work = Work(title, total, watchers, done)
+    with _set(_innermost, work):
+        try:
+            for watcher in watchers:
+                watcher.began(work)
+            yield work
+        except BaseException:
+            work.failed = True
+            raise
+        finally:
+            for watcher in watchers:
+                watcher.ended(work)
 
 
 def innermost() -> Work | None:
@@ -170,3 +181,31 @@ def note(text: str) -> None:
     if (work := _innermost.get()) is not None:
         work.note = text
         work.changed()
+
+
+def log(text: str) -> None:
+    """Gives the reader a line or a table."""
+    for watcher in () if _quiet.get() else _watchers.get():
+        watcher.logged(text)
+
+
+def report(result: object, text: str = "") -> None:
+    """Hands a result on the way to whoever watches.
+
+    Args:
+        result: a step of a search, a state of a chain, a new row.
+        text: what the innermost work notes of it.
+    """
+    for watcher in _watchers.get():
+        watcher.reported(result)
+    if text:
+        note(text)
+
+
+@contextmanager
+def _set(variable: ContextVar[Value], value: Value) -> Iterator[None]:
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)

@@ -6,6 +6,7 @@ belongs to a fit enables them for its own calls only; arrays that come out keep 
 
 import functools
 from collections.abc import Callable
+from contextvars import copy_context
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -27,9 +28,9 @@ def in_float64(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 
 
 def for_other_thread(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
-    """The function with the caller's types; a thread does not inherit those of a context."""
+    """The function with the caller's context and types, neither of which a thread inherits."""
     enabled = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
-    return _with_x64(function, enabled=enabled)
+    return functools.partial(copy_context().run, _with_x64(function, enabled=enabled))
 
 
 def _with_x64(function: Callable[Inputs, Output], *, enabled: bool) -> Callable[Inputs, Output]:

@@ -11,7 +11,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypedDict
@@ -33,7 +33,6 @@ from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import ClipData, load_clip_data, problem_from_clips
 from fitting.experiment.systems import leaf_names
 from fitting.ground.ground_path import place_root
-from fitting.inference.optimise.solution import Progress
 from fitting.inference.sample.blocks import SamplerSettings
 from fitting.motion.accuracy import Accuracy, Errors, clip_errors, summarise
 from fitting.report import pages
@@ -68,7 +67,7 @@ from jaxik.world.similarity import similar
 from .animations import Animation
 from .fit.assess import search_with_noise
 from .fit.sentences import listed
-from .output import Log, output_folder, publish, silent
+from .output import output_folder, publish
 
 NUMBERS = "contribution.json"
 
@@ -133,8 +132,6 @@ def fit_variants(
     folder: Path | None = None,
     *,
     folds: int = 2,
-    progress: Callable[[Progress], None] | None = None,
-    on_row: Callable[[Row], None] | None = None,
 ) -> list[Row]:
     """Fits and measures all variants, the complete one first, each on all splits of the clips.
 
@@ -145,8 +142,6 @@ def fit_variants(
         folder: where finished fits are kept. Those that it has of this experiment, its files and
             these folds are not repeated; those of others are dropped. None keeps them in memory.
         folds: number of parts into which each clip is cut.
-        progress: called as a fit goes on; its stage names the variant and the part.
-        on_row: called with each new row.
 
     Raises:
         ValueError: there are fewer than two folds, or a foot never stands in one of the parts; a
@@ -175,12 +170,12 @@ def fit_variants(
                 if row is None:
                     any_new = True
                     label = f"{name}, {one_split.name}"
-                    with error_context(label):
-                        row = _fit(variant, one_split, labelled(progress, label))
+                    with error_context(label), activity.announced(f"Fitting {label}"):
+                        row = _fit(variant, one_split)
                     row = replace(row, key=key, variant=name, part=part % len(splits))
                     _write(folder, [*rows, row, *finished.values()])
-                    if on_row is not None:
-                        on_row(row)
+                    activity.report(row)
+                    activity.log(row_text(row))
                 # The variant may have another name by now.
                 rows.append(replace(row, variant=name, part=part % len(splits)))
                 fitting.advance()
@@ -263,7 +258,7 @@ def _hide(data: ClipData, frames: slice) -> ClipData:
     return data._replace(reference=replace(reference, mask=mask))
 
 
-def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] | None) -> Row:
+def _fit(variant: Experiment, data: Split) -> Row:
     """The row of a variant on a split, without its key and its name."""
     values, converged, message, seconds = {}, True, "Nothing is free.", 0.0
     ik = variant.starting_system(data.measured[0][0].base.rig)
@@ -271,7 +266,7 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
         fitted = replace(variant, clips=tuple(entry for entry, _ in data.fitted))
         resampled = (_at_rate(clip, variant.fps) for _, clip in data.fitted)
         problem = problem_from_clips(fitted, resampled)
-        problem, solution = search_with_noise(problem, variant, progress)
+        problem, solution = search_with_noise(problem, variant)
         if solution.interrupted:
             raise KeyboardInterrupt
         ik = problem.space.unpack(solution.u)
@@ -309,15 +304,6 @@ def _errors(ik: jaxik.FootIK, data: ClipData, frames: slice) -> Errors:
     _, solved = animation.solve(ik)
     compared = (solved, data.reference, animation.placed_clip)
     return clip_errors(*(clip.select(frames) for clip in compared))
-
-
-def labelled(
-    progress: Callable[[Progress], None] | None, label: str
-) -> Callable[[Progress], None] | None:
-    """Progress whose stage also says what is being fitted."""
-    if progress is None:
-        return None
-    return lambda report: progress(replace(report, stage=f"{label}: {report.stage}"))
 
 
 def _digest(entries: Sequence[ClipEntry]) -> str:
@@ -659,8 +645,6 @@ def ablate(
     output: str | Path | None = None,
     *,
     folds: int = 2,
-    progress: Callable[[Progress], None] | None = None,
-    log: Log = silent,
 ) -> list[Row]:
     """Fits an experiment as it is and without each of its rules, cross-validated.
 
@@ -671,8 +655,6 @@ def ablate(
         experiment: an experiment, or the path of its file.
         output: folder for the fits and the report.
         folds: number of parts into which each clip is cut.
-        progress: called as a fit goes on; its stage names the variant and the part.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: as `fit_variants`, the experiment fits a capture, too, or the folder
@@ -683,12 +665,8 @@ def ablate(
     file_tables.refuse(experiment.capture, str(experiment.path), "ablate")
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
-
-        def log_row(row: Row) -> None:
-            log(row_text(row))
-
-        rows = fit_variants(experiment, folder, folds=folds, progress=progress, on_row=log_row)
+        rows = fit_variants(experiment, folder, folds=folds)
         if folder is not None:
             files.write_text(folder / CELLS, cells(rows))
-        publish(log, folder, document(experiment, rows))
+        publish(folder, document(experiment, rows))
         return rows

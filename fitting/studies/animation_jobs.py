@@ -2,8 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from . import animations, comparison, comparison_report, suite, suite_report
 from .animations import AnimationFiles, load_animation
 from .comparison import Comparison
 from .fit import fit_tables, run_folder
-from .output import Log, output_folder, publish, silent
+from .output import output_folder, publish
 from .suite import Plan, Suite, SystemsOf
 
 
@@ -32,8 +31,6 @@ def compare(
     output: str | Path | None = None,
     *,
     rates: Sequence[float] = (),
-    during: Callable[[str], AbstractContextManager] = nullcontext,
-    log: Log = silent,
 ) -> Comparison:
     """Runs several systems on a flat animation and measures them side by side; warns as `solve`.
 
@@ -42,8 +39,6 @@ def compare(
         animation: the clip, the terrain, and where the root is put for all systems.
         output: folder for the table, the numbers, the figure and the page.
         rates: Hz, at which each system runs too, to see how much its motion depends on them.
-        during: makes a context for the run of each system, from its name.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: there is no system, a file cannot be read, a system does not fit the clip or
@@ -56,10 +51,10 @@ def compare(
         systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
         title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
         loaded = load_animation(animation)
-        compared = comparison.compare(systems, loaded, title=title, during=during)
-        differences = animations.measure(systems, loaded, rates, during)
+        compared = comparison.compare(systems, loaded, title=title)
+        differences = animations.measure(systems, loaded, rates)
         compared = dataclasses.replace(compared, rates=differences)
-        publish(log, folder, comparison_report.document(compared))
+        publish(folder, comparison_report.document(compared))
         for name, (placement, cause) in compared.placements.items():
             animations.warn(placement, cause, name)
         return compared
@@ -70,9 +65,6 @@ def run_suite(
     systems_of: SystemsOf,
     plan: Plan,
     output: str | Path | None = None,
-    *,
-    during: Callable[[str], AbstractContextManager] = nullcontext,
-    log: Log = silent,
 ) -> Suite:
     """Runs systems through made situations and measures each against stated bounds.
 
@@ -83,17 +75,15 @@ def run_suite(
         systems_of: makes systems for the body of a rig, by name.
         plan: which situations; see `fitting.studies.suite.choose`.
         output: folder for the table, the numbers, the pictures and the page.
-        during: makes a context for each situation, from its name.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: the folder cannot be made.
     """
     with output_folder(output) as folder:
-        finished = suite.run_suite(systems_of, plan, during=during)
+        finished = suite.run_suite(systems_of, plan)
         if finished.interrupted:
-            log("interrupted; drawing and writing the finished situations")
-        publish(log, folder, suite_report.document(finished))
+            activity.log("interrupted; drawing and writing the finished situations")
+        publish(folder, suite_report.document(finished))
         return finished
 
 
@@ -104,7 +94,6 @@ def apply(
     output: str | Path | None = None,
     *,
     with_terrain: bool = False,
-    log: Log = silent,
 ) -> Clip:
     """Solves a flat animation with the fitted system of a run; see `solve`.
 
@@ -112,7 +101,7 @@ def apply(
         ValueError: as `solve`, or the folder holds no finished fit.
     """
     ik = run_folder.load_fitted_system(Path(run), animation.flat_clip.rig)
-    return solve(ik, animation, output, with_terrain=with_terrain, log=log)
+    return solve(ik, animation, output, with_terrain=with_terrain)
 
 
 @in_float64
@@ -122,7 +111,6 @@ def solve(
     output: str | Path | None = None,
     *,
     with_terrain: bool = False,
-    log: Log = silent,
 ) -> Clip:
     """Solves a flat animation, and measures how its feet are placed on the ground.
 
@@ -134,7 +122,6 @@ def solve(
         animation: the clip, the terrain, and where the root is put.
         output: .npz, .bvh, .glb or .csv file for the solved clip; see `save_clip`.
         with_terrain: whether a .glb gets the terrain beside the skeleton.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: a file cannot be read or written, or the system does not fit the clip or gives
@@ -159,16 +146,16 @@ def solve(
         joints = animations.arrays(solved, placement)
         ground = mesh_of(loaded.terrain) if with_terrain else None
         save_clip(path, solved, joints=joints, ground=ground)
-    log(animations.solved_text(loaded.reached(result), seconds, path))
+    activity.log(animations.solved_text(loaded.reached(result), seconds, path))
     where = [
         f"root: {loaded.root.reason}",
         flight.describe(loaded.clip),
         animations.trunk_text(result, solved),
         *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
-    log(joined([*filter(None, where), "", animations.text(placement)]))
+    activity.log(joined([*filter(None, where), "", animations.text(placement)]))
     if loaded.captured is not None:
         errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
-        log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
+        activity.log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
     animations.warn(placement, cause)
     return solved

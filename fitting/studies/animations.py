@@ -12,8 +12,7 @@ import dataclasses
 import json
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -307,7 +306,6 @@ def measure(
     systems: Mapping[str, jaxik.FootIK],
     animation: Animation,
     rates: Sequence[float],
-    during: Callable[[str], AbstractContextManager] = nullcontext,
 ) -> list[RateDifference]:
     """The differences of all systems at all rates, system by system.
 
@@ -315,7 +313,6 @@ def measure(
         systems: by name.
         animation: at the rate to which the others are compared.
         rates: Hz, of which whole multiples are the animation's.
-        during: makes a context for the runs of each system, from its name.
 
     Raises:
         ValueError: for another rate, or a system that does not fit the animation.
@@ -325,7 +322,7 @@ def measure(
     for name, ik in systems.items():
         if not steps:
             break
-        with error_context(name), during(name):
+        with error_context(name), activity.announced(f"Compiling and running {name}"):
             animation.check_shapes(ik)
             _, reference = animation.solve(ik)
             for step in steps:

@@ -1,7 +1,6 @@
 """Several systems on one flat animation, measured side by side."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -147,7 +146,6 @@ def compare(
     animation: Animation,
     *,
     title: str = "",
-    during: Callable[[str], AbstractContextManager] = nullcontext,
 ) -> Comparison:
     """Runs all systems on an animation and measures the motions.
 
@@ -157,7 +155,6 @@ def compare(
         systems: by name.
         animation: the flat animation and the terrain, y up.
         title: of tables and figures.
-        during: makes a context for the run of each system, from its name.
 
     Raises:
         ValueError: parameters do not fit the legs, or give poses that are not finite.
@@ -169,7 +166,7 @@ def compare(
     clips = {ANIMATED: clip}
     reached = {ANIMATED: np.full((clip.frame_count, len(clip.rig.joints)), np.nan)}
     for name, ik in systems.items():
-        with error_context(name), during(name):
+        with error_context(name), activity.announced(f"Compiling and running {name}"):
             result, clips[name] = animation.solve(ik)
         reached[name] = animation.reached(result)
 

@@ -27,7 +27,7 @@ from .draft import (
     reconstruct_grounds,
 )
 from .fit import goodness_report
-from .output import Log, output_folder, silent
+from .output import output_folder
 
 AS_IT_COMES = "{} as it comes, for this body, without any fit:"
 NOTHING_FREE = "free: nothing; a fit writes these parameters and judges them, in seconds"
@@ -204,7 +204,7 @@ def _meanings(experiment: Experiment, rig: jaxik.Rig) -> Iterator[tuple[str, str
 
 
 @in_float64
-def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Experiment:
+def init(request: DraftRequest, output: str | Path) -> Experiment:
     """Writes an experiment that runs as it is, with every key and what it means.
 
     Where clips come without ground, it is reconstructed from their stances; parameters are free
@@ -214,7 +214,6 @@ def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Exp
     Args:
         request: the clips, and what there is besides.
         output: folder for the experiment and the grounds; it may hold other files.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: a file cannot be read, the folder holds an experiment or ground already, or
@@ -228,7 +227,7 @@ def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Exp
         clips = request.load()
     with output_folder(folder):
         if not request.terrains:
-            log("no --terrain: the ground is reconstructed from where the feet stand")
+            activity.log("no --terrain: the ground is reconstructed from where the feet stand")
         grounds = reconstruct_grounds(request, clips, folder)
         meshes = [ground.mesh for ground in grounds if ground is not None]
         for mesh in meshes:
@@ -246,5 +245,5 @@ def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Exp
         write(drafted)
         path = drafted.experiment.path
         ending = f"written to {path}; now: jaxik fit {path} -o RUN"
-        log(joined(["", text(drafted), "", ending]))
+        activity.log(joined(["", text(drafted), "", ending]))
         return drafted.experiment

@@ -1,14 +1,9 @@
 """Where a job's results and its lines of text go."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
 
-import jaxik
-from fitting.experiment.experiment import Experiment
-from fitting.experiment.problems import ClipData
-from fitting.problem.problem import Problem
 from fitting.report import pages
 from fitting.report.document import Document, text
 from fitting.report.formatting import joined
@@ -16,21 +11,6 @@ from fitting.runtime import activity
 from fitting.runtime.claimed_folder import claimed
 
 from .fit import run_folder
-
-Log: TypeAlias = Callable[[str], object]
-"""Takes a line or a table, as the command line prints it."""
-Loaded: TypeAlias = Callable[[Experiment, Problem[jaxik.FootIK], tuple[ClipData, ...]], object]
-"""Takes what a fit is about, once it is loaded."""
-
-
-def silent(line: str) -> None:
-    """Drops a line of the log."""
-
-
-def unwatched(
-    experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
-) -> None:
-    """Looks at nothing of what is loaded."""
 
 
 @contextmanager
@@ -48,24 +28,18 @@ def output_folder(output: str | Path | None) -> Iterator[Path | None]:
         yield Path(output)
 
 
-def publish(log: Log, folder: Path | None, document: Document) -> None:
-    """Writes a document into the folder, if there is one, and logs it in brief.
-
-    Args:
-        log: takes the text, and where the results are.
-        folder: for its files.
-        document: what a study says.
-    """
+def publish(folder: Path | None, document: Document) -> None:
+    """Writes a document into the folder, if there is one, and logs it in brief."""
     if folder is not None:
         with activity.announced("Drawing the report"):
             document.write(folder)
-    log(joined(["", text(document)]))
-    log_output(log, folder, document.file)
+    activity.log(joined(["", text(document)]))
+    log_output(folder, document.file)
 
 
-def log_output(log: Log, folder: Path | None, name: str) -> None:
+def log_output(folder: Path | None, name: str) -> None:
     """Logs where the results are, and the name of the file to read first."""
     if folder is not None:
         page = folder / pages.PAGE
         in_browser = f", or open {page} in a browser" if page.is_file() else ""
-        log(f"written to {folder}; read {folder / name}{in_browser}")
+        activity.log(f"written to {folder}; read {folder / name}{in_browser}")

@@ -13,7 +13,6 @@ is so fine that a riser of stairs is one centimetre deep.
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
@@ -35,6 +34,7 @@ from fitting.motion.measures import (
     Placement,
     Soles,
 )
+from fitting.runtime import activity
 from fitting.synthetic import actions, walker
 from fitting.synthetic.footsteps import smoothstep
 from jaxik.world.terrain import Terrain, heightfield
@@ -410,12 +410,7 @@ class Suite:
         return sum(bool(cell.is_within) for cell in every), len(every) + failed
 
 
-def run_suite(
-    systems_of: SystemsOf,
-    plan: Plan,
-    *,
-    during: Callable[[str], AbstractContextManager] = nullcontext,
-) -> Suite:
+def run_suite(systems_of: SystemsOf, plan: Plan) -> Suite:
     """Runs systems through the situations of a plan.
 
     KeyboardInterrupt (Ctrl-C) ends the suite; the finished situations are returned with
@@ -424,13 +419,14 @@ def run_suite(
     Args:
         systems_of: makes the systems for a body.
         plan: which situations, and how long they are.
-        during: makes a context for each situation, from its name.
     """
     scenes: list[Scene] = []
     try:
-        for situation in plan.situations:
-            with during(situation.name):
-                scenes.append(_run(situation, systems_of, plan.seconds))
+        total = len(plan.situations)
+        with activity.announced(f"Running {total} situations", total) as running:
+            for situation in plan.situations:
+                with running.part(situation.name):
+                    scenes.append(_run(situation, systems_of, plan.seconds))
     except KeyboardInterrupt:
         return Suite(plan, tuple(scenes), interrupted=True)
     return Suite(plan, tuple(scenes))

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,13 +11,11 @@ from typing import Any
 
 import jaxik
 from fitting import viewer
-from fitting.experiment.experiment import Experiment
-from fitting.experiment.problems import ClipData
-from fitting.inference.optimise.solution import Progress, Report
+from fitting.inference.optimise.solution import Report
 from fitting.problem.capture_system import alone
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
-from fitting.studies.output import Log, silent
+from fitting.studies.fit.fit_jobs import Loaded
 
 EXTRA = 'needs viser: pip install "jaxik[view]"'
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -35,16 +33,13 @@ class Address:
 
 
 @contextmanager
-def opened(
-    subject: viewer.Subject, folder: Path, address: Address = Address(), log: Log = silent
-) -> Iterator[Any]:
+def opened(subject: viewer.Subject, folder: Path, address: Address = Address()) -> Iterator[Any]:
     """A `fitting.viewer.page.Viewer` while it is open.
 
     Args:
         subject: what is viewed.
         folder: where Save writes.
         address: of the page.
-        log: called with where to find it.
 
     Raises:
         ValueError: viser is not installed, or the address or the folder does not exist.
@@ -59,9 +54,10 @@ def opened(
         with activity.announced("Preparing the page"):
             shown = page.Viewer(server, subject, folder)
         stack.callback(shown.close)
-        log(f"{subject.title}: open {page.address(server)} in a browser")
+        activity.log(f"{subject.title}: open {page.address(server)} in a browser")
         if address.host not in LOOPBACK:
-            log(f"note: whoever reaches {address.host} can move sliders, and save into {folder}")
+            note = f"note: whoever reaches {address.host} can move sliders, and save into {folder}"
+            activity.log(note)
         yield shown
 
 
@@ -70,7 +66,6 @@ def view(
     folder: str | Path,
     address: Address = Address(),
     *,
-    log: Log = silent,
     until: threading.Event | None = None,
 ) -> None:
     """Shows a page until an event is set, or for ever; KeyboardInterrupt (Ctrl-C) ends it.
@@ -80,16 +75,14 @@ def view(
     """
     event = until or threading.Event()
     try:
-        with opened(subject, Path(folder), address, log):
+        with opened(subject, Path(folder), address):
             while not event.wait(0.5):
                 pass
     except KeyboardInterrupt:
-        log("")
+        activity.log("")
 
 
-def view_run(
-    run: str | Path, folder: str | Path | None, address: Address = Address(), *, log: Log = silent
-) -> None:
+def view_run(run: str | Path, folder: str | Path | None, address: Address = Address()) -> None:
     """Shows the clips of a run; Save writes into its folder, unless another one is named.
 
     Raises:
@@ -97,7 +90,7 @@ def view_run(
     """
     if folder is not None:
         check_folder(Path(folder))
-    view(viewer.subject_of_run(Path(run)), folder or run, address, log=log)
+    view(viewer.subject_of_run(Path(run)), folder or run, address)
 
 
 def check_folder(folder: Path) -> None:
@@ -112,20 +105,16 @@ def check_folder(folder: Path) -> None:
 
 
 @dataclass
-class FitWatch:
+class FitWatch(activity.Watcher):
     """Shows the best point of a fit on a page while the search goes on.
 
     Args:
         folder: of the run, where Save writes.
         address: of the page.
-        progress: called with every report, too.
-        log: called with where to find the page.
     """
 
     folder: Path
     address: Address
-    progress: Callable[[Progress], None]
-    log: Log = silent
     viewer: Any = field(default=None, repr=False)
     """The `fitting.viewer.page.Viewer`, once there is one."""
     _page: ExitStack = field(default_factory=ExitStack, repr=False)
@@ -139,26 +128,23 @@ class FitWatch:
     def __exit__(self, *error: object) -> None:
         self._page.close()
 
-    def load(
-        self, experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
-    ) -> None:
-        """Opens the page, once the clips are loaded."""
-        subject = viewer.subject_of_fit(experiment, problem, clips)
-        self._problem = problem
-        page = opened(subject, self.folder, self.address, self.log)
-        self.viewer = self._page.enter_context(page)
+    def reported(self, result: object) -> None:
+        """Opens the page once the clips are loaded; then shows the best point, now and then."""
+        if isinstance(result, Loaded):
+            self._problem = result.problem
+            page = opened(viewer.subject_of_fit(*result), self.folder, self.address)
+            self.viewer = self._page.enter_context(page)
+        elif isinstance(result, Report) and self._problem is not None:
+            self._show(result, self._problem)
 
-    def __call__(self, progress: Progress) -> None:
-        """Shows the best point where it is another than the one shown, now and then."""
-        self.progress(progress)
+    def _show(self, report: Report, problem: Problem[jaxik.FootIK]) -> None:
+        """Shows the best point where it is another than the one shown."""
         cost, when = self._shown
         now = time.monotonic()
-        if not isinstance(progress, Report) or self._problem is None:
-            return
-        if progress.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
-            self._shown = (progress.best, now)
-            ik = alone(self._problem.space.unpack(progress.best_u))
-            note = f"The fit goes on: {progress.stage}, best cost {progress.best:.6g}."
+        if report.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
+            self._shown = (report.best, now)
+            ik = alone(problem.space.unpack(report.best_u))
+            note = f"The fit goes on: {report.stage}, best cost {report.best:.6g}."
             self.viewer.restart(BEST, ik, note)
 
 

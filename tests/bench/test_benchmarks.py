@@ -444,7 +444,7 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
     assert timings.samples["its search, empty cache"] == [1.0]
     assert set(measure("fit", cold=False).samples) == {"ours", "SciPy with our slopes"}
 
-    def interrupted(problem, progress):
+    def interrupted(problem):
         return dataclasses.replace(find_best_fit(problem), interrupted=True)
 
     monkeypatch.setattr(fits, "find_best_fit", interrupted)

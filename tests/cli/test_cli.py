@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -117,6 +118,7 @@ signal.raise_signal(signal.SIGINT)
 # An import that is interrupted, as modules of C report it.
 IMPORTED = """
 import signal
+from contextlib import suppress
 try:
     signal.raise_signal(signal.SIGINT)
 except KeyboardInterrupt:
@@ -159,20 +161,13 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_second_one_ends_
     ended = Mock()
     monkeypatch.setattr(start, "end", ended)
 
-    def show(_) -> str:
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            pass
-        return "going on"
-
     report = Progress("start", 0, 0, 1.0, 1.0, 0.0)
-    with activity.announced("Searching") as work, progress.ProgressLine(show) as line:
-        line(report)
-        assert work.note == "going on"
+    with progress.interruptible():
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
         assert "Ctrl-C again stops at once" in capfd.readouterr().err
         with pytest.raises(KeyboardInterrupt):
-            line(report)
+            activity.report(report)
         assert not ended.called
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)

@@ -229,9 +229,11 @@ def hill_folder(tmp_path_factory):
 def test_the_root_follows_a_hill_unless_it_stays_as_animated_or_its_system_puts_it_there(
     hill_folder,
 ):
-    loaded, lines = load(hill_folder, clips=HILL), []
-    (scene,) = problems.make_problem(loaded, lines.append).data
-    assert lines[0].startswith("root of walker seed 0: on the ground below it, 0 to ")
+    loaded = load(hill_folder, clips=HILL)
+    clips = problems.load_clips(loaded)
+    (scene,) = problems.problem_from_clips(loaded, clips).data
+    line = next(problems.remarks(clips))
+    assert line.startswith("root of walker seed 0: on the ground below it, 0 to ")
     data = problems.load_clip_data(loaded.clips[0], None)
     assert data.root.rise is not None
     np.testing.assert_allclose(scene.frames.world_from_model.pos[:, 1], data.root.rise)

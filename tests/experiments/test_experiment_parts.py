@@ -29,6 +29,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world import body
 from support.bodies import scaled
 from support.experiments import CLIP, ROOT, write
+from support.watching import listening
 
 # Frames that are held out
 
@@ -174,7 +175,7 @@ def test_an_ablation_measures_each_clip_with_its_body(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "_errors", errors)
     monkeypatch.setattr(ablation, "summarise", lambda errors: None)
     measured = [(clip, slice(None)), (giant, slice(None))]
-    ablation._fit(experiment, ablation.Split("", [], measured), None)
+    ablation._fit(experiment, ablation.Split("", [], measured))
     assert rays[1] == pytest.approx(2.0 * rays[0], rel=1e-4)
 
 
@@ -363,7 +364,7 @@ def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkey
     fitted = Fit(experiment, problem, solution, cast(Any, None))
     searches, lines = [], []
 
-    def search(problem, settings, progress, start) -> Any:
+    def search(problem, settings, start) -> Any:
         searches.append((settings.fit.starts, *problem.space.values(start)))
         return SimpleNamespace(u=start + [0.0, 0.0, 2.0], cost=2.0, interrupted=False)
 
@@ -375,7 +376,8 @@ def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkey
     ankle = np.sqrt(np.mean(play.errors["ankle"] ** 2))
     assert price.errors["ankle"][0] == pytest.approx(ankle)
     assert price.errors["ankle"][1] != pytest.approx(ankle)
-    (section,) = fit_jobs._price_of_record(fitted, None, lines.append)
+    with listening(lines.append):
+        (section,) = fit_jobs._price_of_record(fitted)
     sentence, table = section.blocks
     assert isinstance(sentence, Text) and isinstance(table, Grid)
     assert lines == ["what the record costs: a search in which target.rise_half_life are free, too"]

@@ -24,6 +24,7 @@ from fitting.studies.calibrate import calibration
 from fitting.studies.calibrate.replicates import DRAWS, LEVELS
 from fitting.studies.population import population
 from support.curves import curve_problem
+from support.watching import listening
 
 SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)
 PARAMETER = {
@@ -78,7 +79,12 @@ def solved() -> tuple[Problem, Solution, bytes]:
 def load_search(path: Path) -> None:
     """Goes on from a file; what a fit only warns of is an error."""
     problem, solution, _ = solved()
-    checkpoints = Checkpoints(path.parent, path.name, "a fit", _refuse)
+    with listening(_refuse):
+        _go_on(problem, solution, path)
+
+
+def _go_on(problem: Problem, solution: Solution, path: Path) -> None:
+    checkpoints = Checkpoints(path.parent, path.name, "a fit")
     first = SearchState.at(np.asarray(problem.space.start), seed=0)
     attached = checkpoints.attach(Search(problem, SETTINGS), first, 1)
     assert attached.recall is not None
@@ -113,6 +119,6 @@ def load_rows(path: Path) -> None:
 def load_replicate(path: Path) -> None:
     """As `jaxik calibrate` reads it."""
     kind = path.parent.name
-    stage = calibration._Stage(path.parents[1], 1, None, print, ["lean.gain"], kind)
-    (result,) = stage.run(_refuse, [None], print)
+    stage = calibration._Stage(path.parents[1], 1, None, ["lean.gain"], kind)
+    (result,) = stage.run(_refuse, [None])
     assert result["number"] == 0 and isinstance(result["seconds"], float)

@@ -20,6 +20,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.simulation import autoregression
 from fitting.problem.space import SPREAD, Prior
 from support.problems import parameter, posterior_of, problem_of, problem_of_fractions
+from support.watching import listening
 
 TRACES = []  # one entry for each time that JAX traces the residuals
 STATE = cast(RandomState, np.random.RandomState(0).get_state())
@@ -75,13 +76,11 @@ def normal(size: int, seed: int = 0) -> Normal:
     return Normal(problem_of_fractions(size, data, linear_in_u), mean, covariance)
 
 
-def sample(
-    problem, start_u, start_sd, *, seed=0, path=None, progress=None, **settings
-) -> Posterior:
+def sample(problem, start_u, start_sd, *, seed=0, path=None, **settings) -> Posterior:
     """The posterior with these settings of the sampler."""
     start = WalkerStart(np.asarray(start_u), np.asarray(start_sd))
     return posterior.sample_posterior(
-        problem, start, SamplerSettings(**settings), seed=seed, path=path, progress=progress
+        problem, start, SamplerSettings(**settings), seed=seed, path=path
     )
 
 
@@ -193,7 +192,8 @@ def test_thinning_stores_one_step_in_so_many_and_a_short_run_says_that_it_is():
 def test_progress_is_reported_and_nothing_compiles_between_checks():
     reports = []
     TRACES.clear()
-    normal(7).sample(max_steps=200, check_every=20, progress=reports.append)
+    with listening(reported=reports.append):
+        normal(7).sample(max_steps=200, check_every=20)
     assert len(TRACES) == 1  # half of the walkers at a time, at the start too
     normal(7, seed=1).sample(seed=1, max_steps=40)
     assert len(TRACES) == 1
@@ -231,7 +231,8 @@ def test_an_interrupt_returns_the_chain_and_the_run_can_go_on(tmp_path, monkeypa
     whole, other = (normal(3).sample(max_steps=90, seed=seed) for seed in (0, 1))
     assert not np.array_equal(other.u[0], whole.u[0])
     path = tmp_path / "chain.h5"
-    part = normal(3).sample(max_steps=90, path=path, check_every=5, progress=interrupt)
+    with listening(reported=interrupt):
+        part = normal(3).sample(max_steps=90, path=path, check_every=5)
     assert part.message.startswith("Interrupted, the chain is kept.") and not part.converged
     assert np.array_equal(part.u, whole.u[:35])
     rest = normal(3).sample(max_steps=90, path=path)
@@ -269,7 +270,8 @@ def test_a_kill_loses_no_finished_step_wherever_it_tears_the_journal(tmp_path):
         copies.append((copy, stored - bool(torn)))
 
     path = tmp_path / "chain.h5"
-    whole = known.sample(**run, path=path, progress=snapshot)
+    with listening(reported=snapshot):
+        whole = known.sample(**run, path=path)
     assert len(copies) == 7
     for copy, finished in copies:
         with Chain(identity_of(known.problem, walkers=12, thin_by=2), copy) as chain:

@@ -16,6 +16,7 @@ from fitting.inference.optimise import descent, evolution, levenberg_marquardt, 
 from fitting.inference.optimise.solution import (
     ROUNDING,
     Point,
+    Report,
     Search,
     SearchSettings,
     SearchState,
@@ -26,6 +27,7 @@ from fitting.problem.problem import Problem
 from support import toy
 from support.curves import CURVE_TRUTH, Curve, curve_problem
 from support.problems import Fractions, compilations, problem_of_fractions
+from support.watching import listening
 
 TOLERANCE = 0.05  # fraction of the range within which a fit must recover the truth
 WITH_THRESHOLD = ("height", "rate", "turn")
@@ -94,14 +96,15 @@ def test_the_reports_name_the_stages_and_the_best_cost_never_rises():
 def test_an_interrupt_keeps_the_best_point():
     reports = []
 
-    def interrupt_tenth_report(report: search.Progress) -> None:
-        assert isinstance(report, search.Report)
+    def interrupt_tenth_report(report: object) -> None:
+        assert isinstance(report, Report)
         reports.append(report)
         if len(reports) == 10:
             raise KeyboardInterrupt
 
     problem = toy.make_problem()
-    solution = search.find_best_fit(problem, progress=interrupt_tenth_report)
+    with listening(reported=interrupt_tenth_report):
+        solution = search.find_best_fit(problem)
     assert not solution.converged
     assert solution.message.startswith("Interrupted after")
     assert solution.cost == min(report.best for report in reports) < solution.cost_before

@@ -22,12 +22,14 @@ from fitting.inference.optimise.solution import Progress, Solution
 from fitting.motion.accuracy import Accuracy
 from fitting.report import pages
 from fitting.report.formatting import ACCURACY
+from fitting.runtime import activity
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
 from support.small_studies import SIX_SECONDS, WITHOUT, write_ablation
+from support.watching import Recorder, listening
 
 ALL, PITCH, BOTH = COMPLETE, "pitch", "both"
 EVERYTHING = "everything"
@@ -178,13 +180,15 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
 def test_without_a_folder_nothing_is_written_and_progress_says_what_is_fitted(
     tmp_path, search, monkeypatch
 ):
-    experiment, stages = load(tmp_path), []
+    experiment, recorder = load(tmp_path), Recorder()
     before = set(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
-    rows = ablation.fit_variants(experiment, progress=lambda report: stages.append(report.stage))
+    with activity.watched_by(recorder):
+        rows = ablation.fit_variants(experiment)
     assert len(rows) == 9 and set(tmp_path.iterdir()) == before
-    assert stages[0] == "all rules, part 1 of 2: polish"
-    assert stages[-1] == "pitch, everything: polish"
+    fits = [title for title in recorder.titles if title.startswith("Fitting ")]
+    assert fits[:2] == ["Fitting 3 variants", "Fitting all rules, part 1 of 2"]
+    assert fits[-1] == "Fitting pitch, everything"
 
 
 # What is not fitted again
@@ -195,9 +199,8 @@ def test_only_changed_variants_are_fitted_again(tmp_path, search, monkeypatch):
     monkeypatch.setattr(ablation.jax, "clear_caches", lambda: clearings.append(len(new)))
 
     def ablate(rest: str = WITHOUT, top: str = "", folds: int = 2) -> list[Row]:
-        return ablation.fit_variants(
-            load(tmp_path, rest, top=top), out, folds=folds, on_row=new.append
-        )
+        with listening(reported=new.append):
+            return ablation.fit_variants(load(tmp_path, rest, top=top), out, folds=folds)
 
     first = ablate()
     assert new == first and len(search.calls) == 6

@@ -26,12 +26,13 @@ from fitting.problem.problem import Problem
 from fitting.report import document, pages
 from fitting.studies.calibrate import calibration, calibration_report, replicates
 from fitting.studies.calibrate.assessment import Assessment, assess, summarise
-from fitting.studies.calibrate.calibration import Calibration, CalibrationProgress, Observers
+from fitting.studies.calibrate.calibration import Calibration
 from support import small_studies
 from support.experiments import ROOT
 from support.pages import Page
 from support.problems import compilations
 from support.small_studies import SAMPLE, kept, write_calibration
+from support.watching import listening
 
 RANKED = ["pelvis.on_gain", "foot.max_pitch", "log-probability"]
 COUNT = 8  # of the replicates that all tests share
@@ -72,9 +73,9 @@ class Made(NamedTuple):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Made:
     folder, lines = tmp_path_factory.mktemp("calibration"), []
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, listening(lines.append):
         path, out = small_studies.quick_calibration(folder, patch), folder / "out"
-        found = fitting.calibrate(path, out, replicates=COUNT, chains=True, log=lines.append)
+        found = fitting.calibrate(path, out, replicates=COUNT, chains=True)
         return Made(out, "\n".join(lines), found, calibrate(path, out, COUNT, chains=True))
 
 
@@ -128,7 +129,7 @@ def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made, experime
     text = document.text(calibration_report.document(experiment, changed, assessment))
     assert "Replicates in another valley: 2, 3 (2 in all)." in text
     assert "In another valley, but said to have converged: 2 (1 in all)." in text
-    assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])
+    assert "a valley 3.5 above the truth's" in replicates.fit_line(fits[1])
 
 
 def test_costs_of_valleys_are_compared_without_the_weight_of_residuals(experiment_file):
@@ -214,18 +215,16 @@ def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
 
 def test_a_cluster_makes_the_same_replicates(made, experiment_file, tmp_path):
     there = tmp_path / "there"
-    reports: list[CalibrationProgress] = []
+    reports: list[Any] = []
     options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(n_workers=1, processes=False, **options) as workers:
         address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
-        assessment = fitting.calibrate(
-            experiment_file, there, replicates=2, scheduler=address, progress=reports.append
-        )
+        with listening(reported=reports.append):
+            assessment = fitting.calibrate(experiment_file, there, replicates=2, scheduler=address)
     assert summarise(assessment) == summarise(assess(Calibration(made.kept.fits[:2], [])))
     here = kept(made.folder)
     assert all(here[name] == fit for name, fit in kept(there).items() if name.startswith("fits/"))
-    assert {report.replicate for report in reports} == {1, 2}
-    assert reports[-1].stage == "2 of 2 fits done" and reports[-1].remaining == 0.0
+    assert {report["number"] for report in reports} == {0, 1}
 
 
 def test_finished_replicates_are_not_repeated_and_new_ones_share_their_programs(
@@ -236,15 +235,15 @@ def test_finished_replicates_are_not_repeated_and_new_ones_share_their_programs(
     programs: dict[str, int] = {}  # compiled until a replicate was made
     with compilations() as compiled:
 
-        def note(kind: str, result) -> None:
-            programs[f"{kind} {result['number']}"] = len(compiled)
+        def note(result) -> None:
+            if isinstance(result, dict):
+                kind = "chain" if "draws" in result else "fit"
+                programs[f"{kind} {result['number']}"] = len(compiled)
 
-        observers = Observers(
-            on_fit=lambda fitted: note("fit", fitted), on_chain=lambda chain: note("chain", chain)
-        )
-        first = calibrate(experiment_file, made.folder, 6, observers=observers)
-        assert not programs and first == Calibration(made.kept.fits[:6], [])
-        calibrate(experiment_file, made.folder, COUNT, chains=True, observers=observers)
+        with listening(reported=note):
+            first = calibrate(experiment_file, made.folder, 6)
+            assert not programs and first == Calibration(made.kept.fits[:6], [])
+            calibrate(experiment_file, made.folder, COUNT, chains=True)
     assert list(programs) == ["fit 6", "fit 7", "chain 5", "chain 6", "chain 7"]
     assert programs["fit 6"] == programs["fit 7"]
     assert programs["chain 5"] == programs["chain 7"]

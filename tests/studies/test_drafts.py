@@ -30,6 +30,7 @@ from support import quick
 from support.experiments import ROOT, write
 from support.sample_clips import flat_floor, stair_walk
 from support.small_studies import HALF_SECOND
+from support.watching import listening
 
 WALK, BASE = ROOT / "data/clips/uneven_walk.npz", ROOT / "data/clips/uneven_walk_base.npz"
 GROUND = ROOT / "data/terrains/uneven_walk.ply"
@@ -50,10 +51,10 @@ def drafted(tmp_path_factory) -> tuple[Path, str]:
     preset = Preset("record", faithful=True)
     request = DraftRequest((folder / WALK.name,), (GROUND,), (folder / BASE.name,), preset)
     lines: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, listening(lines.append):
         patch.setattr(draft, "choose_free", choose_few)
         patch.setattr(problems, "load_clip", Mock(side_effect=AssertionError("read twice")))
-        jobs.init(request, folder / "draft", log=lines.append)
+        jobs.init(request, folder / "draft")
     return folder / "draft" / draft.EXPERIMENT, "\n".join(lines)
 
 

@@ -1,6 +1,5 @@
 """Studies that are interrupted or killed, and what the next call makes of their folders."""
 
-import inspect
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from fitting.studies.population import population
 from support import runs, small_studies
 from support.experiments import ROOT, write
 from support.small_studies import HALF_SECOND, ONE_START, TWO_HALF_SECONDS, kept
+from support.watching import listening
 
 FEW = "[fit]\nstarts = 2\n[fit.search]\nagreeing_starts = 3\n"
 SEARCH = "search_with_noise"
@@ -96,10 +96,10 @@ def watch(patch: pytest.MonkeyPatch, stop: Stop, *, interrupted: bool = False) -
 
     def called(*arguments, **named):
         calls.append(stop.function)
-        bound = inspect.signature(function).bind(*arguments, **named)
         if interrupted and len(calls) == stop.call:
-            bound.arguments["progress"] = interrupt
-        return function(*bound.args, **bound.kwargs)
+            with listening(reported=interrupt):
+                return function(*arguments, **named)
+        return function(*arguments, **named)
 
     patch.setattr(stop.module, stop.function, called)
     return calls
@@ -166,16 +166,17 @@ def test_a_killed_fit_goes_on_after_its_search_and_after_the_last_stage_of_its_p
     killed, experiment_file, monkeypatch
 ):
     stages, lines = list(profiling.STAGES), []
-    with monkeypatch.context() as patch, pytest.raises(Killed):
+    with monkeypatch.context() as patch, pytest.raises(Killed), listening(lines.append):
         patch.setattr(profiling, "STAGES", [*stages[:4], kill])
-        fitting.fit(experiment_file, killed, log=lines.append)
+        fitting.fit(experiment_file, killed)
     assert "a fit that was interrupted here goes on after 14 stages of its search" in lines
     whole, rehearsal = killed.parent / "whole", Mock()
     monkeypatch.setattr(fit_jobs, "Rehearsal", rehearsal)
     fitting.fit(experiment_file, whole, report=False)
     rehearsal.assert_not_called()  # its motions are for the report
     monkeypatch.setattr(profiling, "STAGES", [kill] * 4 + stages[4:])
-    fitting.fit(experiment_file, killed, log=lines.append)
+    with listening(lines.append):
+        fitting.fit(experiment_file, killed)
     assert any(line.endswith(" of its search and 4 of its profiles") for line in lines)
     assert not (killed / run_folder.SEARCH).exists() and not (killed / LOCK).exists()
     assert kept(killed) == kept(whole)
@@ -190,8 +191,8 @@ def test_the_search_of_another_experiment_is_not_used(killed, experiment_file, m
     for change in ("seed = 1", 'loss = "huber"'):
         lines: list[str] = []
         other.write_text(f"{change}\n{experiment_file.read_text()}")
-        with pytest.raises(Killed):
-            fitting.fit(other, killed, log=lines.append)
+        with pytest.raises(Killed), listening(lines.append):
+            fitting.fit(other, killed)
         (line,) = [line for line in lines if run_folder.SEARCH in line]
         assert "of another fit, or of another version; the fit begins anew" in line, change
 

@@ -34,6 +34,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world import similarity
 from support import scenes, small_studies
 from support.experiments import ROOT
+from support.watching import listening
 
 
 @pytest.fixture
@@ -112,7 +113,8 @@ def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_fi
 
     monkeypatch.setattr(many_fits, "_computed", interrupted)
     lines: list[str] = []
-    fits = fit_many(experiment_file, out, seeds=2, log=lines.append)
+    with listening(lines.append):
+        fits = fit_many(experiment_file, out, seeds=2)
     assert fits.interrupted and len(fits.finished) == 2 and fits.made == 1
     rest = "2 of 4 fits are finished; the same command makes the 2 that are missing."
     assert any(rest in line for line in lines)
@@ -137,12 +139,14 @@ def test_each_fit_is_a_run_and_a_row(finished):
 def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, monkeypatch):
     lines: list[str] = []
     (out / finished.rows[0]["run"] / many_tasks.ROW).unlink()
-    assert fit_many(experiment_file, out, seeds=2, log=lines.append).made == 1
+    with listening(lines.append):
+        assert fit_many(experiment_file, out, seeds=2).made == 1
     assert "4 fits of 1 experiment, 2 seeds for each clip; 3 are there already" in lines
     monkeypatch.setattr(task_of_worker, "fit", None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (out / many_tasks.PARQUET).unlink()
-    again = fit_many(experiment_file, out, seeds=2, log=lines.append)
+    with listening(lines.append):
+        again = fit_many(experiment_file, out, seeds=2)
     assert again.rows[1:] == finished.rows[1:] and again.made == 0
     assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
     assert (out / many_tasks.CSV).is_file() and not (out / many_tasks.PARQUET).exists()

@@ -23,6 +23,7 @@ from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
 from support.small_studies import GIVEN, MEASURED, SUBJECTS, VARYING, kept, write_population
+from support.watching import listening
 
 
 class Made(NamedTuple):
@@ -38,9 +39,9 @@ class Made(NamedTuple):
 def made(tmp_path_factory) -> Made:
     """Tests must not change its folder."""
     folder, lines = tmp_path_factory.mktemp("population"), []
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, listening(lines.append):
         walks, out = small_studies.quick_population(folder, patch), folder / "out"
-        fitted = fitting.population(walks, out, log=lines.append)
+        fitted = fitting.population(walks, out)
     return Made(walks, out, "\n".join(lines), fitted)
 
 
@@ -97,10 +98,10 @@ def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
     estimated: list[int] = []
     search = population.search_with_noise
 
-    def watched(problem, experiment, progress):
+    def watched(problem, experiment):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
         quiet = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
-        return search(problem, quiet, progress)
+        return search(problem, quiet)
 
     monkeypatch.setattr(population, "search_with_noise", watched)
     rest, out = VARYING.replace(GIVEN, '[noise]\nsigmas = "estimated"\n'), tmp_path / "out"

@@ -4,7 +4,6 @@ import functools
 import json
 import math
 import re
-from contextlib import contextmanager
 
 import jax
 import numpy as np
@@ -14,6 +13,7 @@ from fitting import jobs
 from fitting.cli import main
 from fitting.experiment.systems import preset_names, preset_system
 from fitting.motion.measures import Extreme
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.studies import suite, suite_report
 from fitting.studies import suite as suite_suite
@@ -171,13 +171,13 @@ def test_misses_say_where_and_how_far():
 
 @in_float64
 def test_an_interrupted_suite_keeps_what_is_finished(still, tmp_path):
-    @contextmanager
-    def during(name):
-        if name == FEW[1]:
-            raise KeyboardInterrupt
-        yield
+    class Interrupt(activity.Watcher):
+        def began(self, work: activity.Work) -> None:
+            if work.title == FEW[1]:
+                raise KeyboardInterrupt
 
-    suite = jobs.run_suite(lambda rig: {"still": still}, plan(*FEW), tmp_path, during=during)
+    with activity.watched_by(Interrupt()):
+        suite = jobs.run_suite(lambda rig: {"still": still}, plan(*FEW), tmp_path)
     assert suite.interrupted and [scene.situation.name for scene in suite.scenes] == [FEW[0]]
     assert json.loads((tmp_path / suite_report.NUMBERS).read_text())["interrupted"]
     assert (

@@ -223,7 +223,7 @@ def test_a_verdict_is_true_unless_the_motion_without_errors_says_otherwise(
         fit = replicate(captured, FAR if not true else judgement(), noise_free)
     assert wrong_model.word(captured) == word
     assert is_true(fit) is true
-    assert (", which is not true" in wrong_model_report.fit_line(fit)) is not true
+    assert (", which is not true" in wrong_model.fit_line(fit)) is not true
 
 
 def test_a_kept_system_that_is_worse_than_the_animation_is_outside():

@@ -13,6 +13,7 @@ from fitting.viewer import subject_of_run, views
 from fitting.viewer.views import Address
 from support import runs
 from support.browsers import launch, needs_chromium
+from support.watching import listening
 
 WINDOW = {"width": 720, "height": 420}  # small, for software has to draw it
 LONG = 300.0  # s, on a busy machine
@@ -37,7 +38,7 @@ def viewer(run) -> Iterator[Any]:
     subject = subject_of_run(run)
     system = next(iter(subject.starts.values()))
     subject = dataclasses.replace(subject, free=(free_parameter(system, "leg.weight"),))
-    with views.opened(subject, run, Address(port=0), lines.append) as shown:
+    with listening(lines.append), views.opened(subject, run, Address(port=0)) as shown:
         assert shown.wait(LONG)
         (line,) = lines
         shown.url = next(word for word in line.split() if word.startswith("http"))

@@ -17,6 +17,7 @@ from fitting.inference.optimise.solution import Progress, Report
 from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Soles
 from fitting.problem.space import free_parameter
 from fitting.studies.animations import AnimationFiles, load_animation
+from fitting.studies.fit.fit_jobs import Loaded
 from fitting.studies.fit.fit_motions import saved_clips
 from fitting.viewer import Solver, solving, tuning, views
 from fitting.viewer.page import Latest
@@ -29,6 +30,7 @@ from jaxik.maths import parameter_tree
 from support import runs
 from support.commands import refusal
 from support.experiments import ROOT
+from support.watching import listening
 
 FAITHFUL = Preset("record", faithful=True)
 
@@ -254,22 +256,20 @@ def report(best: float, u: np.ndarray) -> Report:
 @needs_viser
 def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(views, "EVERY", 0.0)
-    heard: list[Progress] = []
     lines: list[str] = []
-    with FitWatch(tmp_path, Address(port=0), heard.append, lines.append) as watch:
-        watch(Progress("start", 0, 0, 9.0, 9.0, 0.0))  # before there is a page
-        watch.load(fitted.experiment, fitted.problem, fitted.clips)
+    with listening(lines.append), FitWatch(tmp_path, Address(port=0)) as watch:
+        watch.reported(Progress("start", 0, 0, 9.0, 9.0, 0.0))  # before there is a page
+        watch.reported(Loaded(fitted.experiment, fitted.problem, fitted.clips))
         assert "open http://127.0.0.1:" in lines[0] and watch.viewer.wait(300)
         u = np.array([0.1, 0.2])
-        watch(report(5.0, u))
+        watch.reported(report(5.0, u))
         assert watch.viewer.wait(300)
         shown = watch.viewer.tuning.ik
         assert watch.viewer.solved.cost == pytest.approx(float(fitted.problem.cost(u)))
-        watch(report(5.0, -u))  # no other best point
+        watch.reported(report(5.0, -u))  # no other best point
         assert watch.viewer.tuning.ik is shown
-        watch(report(6.0, -u))  # with another noise
+        watch.reported(report(6.0, -u))  # with another noise
         assert watch.viewer.tuning.ik is not shown
-    assert len(heard) == 4
 
 
 def test_what_cannot_be_shown_costs_one_line(capsys, tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.problem.problem import Problem, digest_with
-from fitting.runtime import program_cache
+from fitting.runtime import activity, program_cache
 from fitting.runtime.json_files import Finite, JsonFile, between, length
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, in_one_line
@@ -109,31 +109,24 @@ class Checkpoints:
     stages, and add theirs.
     """
 
-    def __init__(
-        self,
-        folder: Path | None,
-        name: str,
-        identity: str,
-        warn: Callable[[str], object] = lambda reason: None,
-    ):
-        """Reads the stages that a killed process has left.
+    def __init__(self, folder: Path | None, name: str, identity: str):
+        """Reads the stages that a killed process has left; logs why some cannot be used.
 
         Args:
             folder: of the file; None keeps none.
             name: of the file, which is written when a stage is finished.
             identity: of the fit. Stages of another one, or of another version of this program, are
                 not used.
-            warn: called with one sentence where there are stages that cannot be used.
         """
         identity = f"{identity} {program_cache.sources()} {dict(program_cache.versions())}"
         self._store = Store(FILE, folder, "the state of another fit, or of another version")
-        self._path, self._warn, self._written = Path(folder or "", name), warn, -np.inf
+        self._path, self._written = Path(folder or "", name), -np.inf
         begun: StoredSearches = {"identity": identity, "searches": {}, "profiles": {}}
         try:
             self._content = self._store.read(name, {"identity": identity}) or begun
         except ValueError as error:
             self._content = begun
-            warn(f"{error}")
+            activity.log(f"{error}")
 
     def __enter__(self) -> "Checkpoints":
         self._token = _current.set(self)
@@ -175,7 +168,9 @@ class Checkpoints:
             try:
                 restore(profiles[key])
             except DAMAGES as error:
-                self._warn(f"{self._path}: damaged ({in_one_line(error)}); the profiles begin anew")
+                activity.log(
+                    f"{self._path}: damaged ({in_one_line(error)}); the profiles begin anew"
+                )
                 del profiles[key]
 
         def keep(stored: StoredProfiles) -> None:
@@ -195,7 +190,7 @@ class Checkpoints:
             for stage in stages:
                 _check(stage, state)
         except DAMAGES as error:
-            self._warn(f"{self._path}: damaged ({in_one_line(error)}); the search begins anew")
+            activity.log(f"{self._path}: damaged ({in_one_line(error)}); the search begins anew")
             stages.clear()
         lines = [line for stage in stages for line in stage["history"]]
         elapsed = lines[-1]["seconds"] if lines else 0.0
@@ -238,7 +233,7 @@ class _Recall:
         if self.position < len(self.stages):
             stored = self.stages[self.position]
             after, used_up = _restored(stored, state), stored["used_up"]
-            search.observe(after)
+            search.reached(after)
         else:
             try:
                 after = stage()

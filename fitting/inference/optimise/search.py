@@ -18,9 +18,8 @@ Levenberg–Marquardt, and the population's costs.
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
 from functools import partial
 
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
-from fitting.runtime.precision import in_float64
+from fitting.runtime.precision import for_other_thread, in_float64
 
 from . import checkpoints, levenberg_marquardt
 from .descent import descend, jacobian_at, point_of, polish
@@ -39,8 +38,6 @@ from .solution import (
     DEFAULTS,
     MAX_STARTS,
     Point,
-    Progress,
-    Report,
     Search,
     SearchSettings,
     SearchState,
@@ -59,7 +56,6 @@ def find_best_fit(
     starts: int = MAX_STARTS,
     first: Float[Array | np.ndarray, " free"] | None = None,
     seed: int = 0,
-    progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
     """The free parameters of minimum cost.
 
@@ -73,7 +69,6 @@ def find_best_fit(
         starts: how many starts to make at most.
         first: the `u` from which the first start makes its first descent; None is the space's.
         seed: of the random draws; the same seed gives the same solution.
-        progress: called with every report.
 
     Raises:
         ValueError: for no start.
@@ -84,9 +79,8 @@ def find_best_fit(
         return _nothing_free(problem)
     first = problem.space.start if first is None else first
     latest = SearchState.at(np.asarray(first), seed=seed)
-    watch = _Watch(progress)
     current = checkpoints.current()
-    search = current.attach(Search(problem, settings, watch), latest, starts)
+    search = current.attach(Search(problem, settings), latest, starts)
     before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
@@ -104,7 +98,7 @@ def find_best_fit(
                 ends += costs
                 searching.advance()
     except KeyboardInterrupt:
-        latest, interrupted = watch.latest or latest, True
+        latest, interrupted = search.latest or latest, True
         if not np.isfinite(latest.best.cost):
             raise
     finally:
@@ -120,7 +114,6 @@ def refine(
     solution: Solution,
     u: Float[np.ndarray, " free"],
     settings: SearchSettings = DEFAULTS,
-    progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
     """A descent to the end from a point that is better than a solution, or for another noise.
 
@@ -131,12 +124,10 @@ def refine(
         solution: the solution so far.
         u: where the descent begins.
         settings: how thoroughly to search.
-        progress: called with every report.
     """
     latest = SearchState.at(np.asarray(u))
-    watch = _Watch(progress)
     current = checkpoints.current()
-    search = current.attach(Search(problem, settings, watch), latest, 0)
+    search = current.attach(Search(problem, settings), latest, 0)
     used_up = interrupted = False
     try:
         with activity.announced("Descending from there"):
@@ -144,7 +135,7 @@ def refine(
     except StepsUsedUp as error:
         latest, used_up = error.state, True
     except KeyboardInterrupt:
-        latest, interrupted = watch.latest or latest, True
+        latest, interrupted = search.latest or latest, True
     finally:
         current.flush()
     if not np.isfinite(latest.best.cost):
@@ -259,23 +250,10 @@ def _begin(
     """Cost of the system as it is, and the state with the first point evaluated."""
     problem = search.problem
     with ThreadPoolExecutor(1) as thread:  # the two programs compile side by side
-        before = thread.submit(copy_context().run, cost_before, problem)
+        before = thread.submit(for_other_thread(cost_before), problem)
         evaluate(problem, np.asarray(problem.space.pack({}))[None])
     lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
     return before.result(), dataclasses.replace(state, evaluated=lm, best=point_of(lm))
-
-
-@dataclasses.dataclass
-class _Watch:
-    """Reports the progress of a search, and keeps its latest state in case of an interrupt."""
-
-    progress: Callable[[Progress], None] | None
-    latest: SearchState | None = None
-
-    def __call__(self, state: SearchState) -> None:
-        self.latest = state
-        if self.progress is not None:
-            self.progress(Report(**vars(state.history[-1]), best_u=state.best.u))
 
 
 @dataclasses.dataclass(frozen=True)

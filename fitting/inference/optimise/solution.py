@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from fitting.inference.settings import Settings, setting
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 
 from .levenberg_marquardt import LMState
 
@@ -43,6 +44,12 @@ class Progress:
     """Minimum cost of the hard program so far, over all starts."""
     seconds: float
     """Since the search began."""
+
+    def __str__(self) -> str:
+        return (
+            f"start {self.start + 1}  {self.stage:<9} step {self.step:<4} "
+            f"cost {self.cost:.6g}  best {self.best:.6g}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,18 +309,18 @@ class StepsUsedUp(Exception):
 Stage: TypeAlias = Callable[[], SearchState]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Search:
     """What all stages of a search share."""
 
     problem: Problem
     settings: SearchSettings = DEFAULTS
-    observe: Callable[[SearchState], None] = lambda state: None
-    """Called with every report."""
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """Seconds."""
     recall: Callable[["Search", str, SearchState, Stage], SearchState] | None = None
     """Gives the state in which a stage ended before the search was killed, or calls the stage."""
+    latest: SearchState | None = None
+    """That was reported last; an interrupted search ends there."""
 
     @property
     def thresholds(self) -> np.ndarray:
@@ -346,8 +353,13 @@ class Search:
         """The state with one more line of history, which is reported."""
         elapsed = time.perf_counter() - self.began
         line = Progress(stage, state.start, state.start_steps, cost, state.best.cost, elapsed)
-        state = dataclasses.replace(state, history=(*state.history, line))
-        self.observe(state)
+        return self.reached(dataclasses.replace(state, history=(*state.history, line)))
+
+    def reached(self, state: SearchState) -> SearchState:
+        """Reports a state by the last line of its history."""
+        self.latest = state
+        line = Report(**vars(state.history[-1]), best_u=state.best.u)
+        activity.report(line, str(line))
         return state
 
     def move(

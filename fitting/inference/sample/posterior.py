@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +41,14 @@ class SamplingProgress:
     """Of the median walker now."""
     autocorrelation_time: float
     """Steps, of the slowest parameter at the last check; NaN before."""
+
+    def __str__(self) -> str:
+        slowest = self.autocorrelation_time
+        ending = "" if math.isnan(slowest) else f"  slowest autocorrelation {slowest:.0f} steps"
+        return (
+            f"step {self.step} of at most {self.max_steps}  acceptance {self.acceptance:.2f}  "
+            f"log p {self.log_probability:.1f}{ending}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +163,6 @@ def sample_posterior(
     *,
     seed: int = 0,
     path: Path | None = None,
-    progress: Callable[[SamplingProgress], None] | None = None,
 ) -> Posterior:
     """Samples until the chain is `stop_at` autocorrelation times long and these are steady.
 
@@ -170,7 +177,6 @@ def sample_posterior(
         settings: how long to sample.
         seed: of the start and of every proposal.
         path: HDF5 file for the chain, in the layout of emcee; None keeps it in memory only.
-        progress: called every `check_every` steps.
 
     Raises:
         ValueError: for shapes, numbers of walkers or widths that are impossible, a start where too
@@ -182,13 +188,7 @@ def sample_posterior(
     walkers = settings.walkers_for(space.size)
     identity = Identity(space.names, walkers, seed, settings.thin_by, digest(problem))
     with Chain(identity, path) as chain:
-
-        def report(check: diagnostics.Check | None) -> None:
-            if progress is not None:
-                elapsed = time.monotonic() - began
-                progress(_describe_progress(chain, check, settings.max_steps, elapsed))
-
-        outcome = _extend(problem, chain, start, settings, report)
+        outcome = _extend(problem, chain, start, settings, began)
     with activity.announced("Summing up the chain"):
         at_start = _log_probability(problem, start, walkers)
         sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
@@ -218,13 +218,9 @@ class _Outcome:
 
 
 def _extend(
-    problem: Problem,
-    chain: Chain,
-    start: WalkerStart,
-    settings: SamplerSettings,
-    report: Callable[[diagnostics.Check | None], None],
+    problem: Problem, chain: Chain, start: WalkerStart, settings: SamplerSettings, began: float
 ) -> _Outcome:
-    """Samples until the chain is long enough or Ctrl-C comes; `report` gets the latest check."""
+    """Samples until the chain is long enough or Ctrl-C comes."""
     # Here, for emcee imports scipy.stats: half a second, for which a fit need not wait.
     from . import sampler
 
@@ -243,7 +239,9 @@ def _extend(
                     next(steps)
                     sampling.reach(len(chain) * thin_by)
                     if len(chain) % interval == 0:
-                        report(latest)
+                        elapsed = time.monotonic() - began
+                        reached = _progress(chain, latest, settings.max_steps, elapsed)
+                        activity.report(reached, str(reached))
                 chain.save()
                 before, latest = latest, _check(chain, length)
                 done, _ = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
@@ -299,7 +297,7 @@ def _check_start(size: int, start: WalkerStart) -> None:
         raise ValueError(f"start.sd is {start.sd}, wanted more than 0 everywhere")
 
 
-def _describe_progress(
+def _progress(
     chain: Chain, check: diagnostics.Check | None, max_steps: int, elapsed: float
 ) -> SamplingProgress:
     last = chain.last

@@ -13,11 +13,10 @@ import numpy as np
 from fitting.inference.proportions import Proportion, RankTest, proportion
 
 from .calibration import Calibration
-from .replicates import DRAWS, LEVELS, LOG_PROBABILITY, ReplicateChain, ReplicateFit
+from .replicates import DRAWS, LEVELS, LOG_PROBABILITY, SAME_VALLEY, ReplicateChain, ReplicateFit
 
 FAMILY_LEVEL = 0.95  # of all checks together
 FIT_LEVEL = 0.95  # of the fit's intervals
-SAME_VALLEY = 3.0  # of cost, above the lowest that a descent from the truth reaches
 IN_VALLEY = 0.98  # of the fits, at least
 NEAR = 0.05  # of its range: a parameter that is so near its truth has come back
 

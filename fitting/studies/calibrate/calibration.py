@@ -13,7 +13,6 @@ import dataclasses
 import functools
 import json
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar
@@ -22,8 +21,6 @@ import numpy as np
 
 import jaxik
 from fitting.experiment.experiment import Experiment
-from fitting.inference.optimise.solution import Progress
-from fitting.inference.sample.posterior import SamplingProgress
 from fitting.problem.problem import Problem, digest
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
@@ -31,10 +28,13 @@ from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, error_context
 from fitting.studies.translation import NamedSystem
 
+from . import wrong_model
 from .replicates import (
     LOG_PROBABILITY,
     ReplicateChain,
     ReplicateFit,
+    chain_line,
+    fit_line,
     fit_replicate,
     sample_replicate,
 )
@@ -49,6 +49,11 @@ FILES = {
     FITS: JsonFile(ReplicateFit, WRITER, ADVICE),
     CHAINS: JsonFile(ReplicateChain, WRITER, ADVICE),
     WRONG_MODEL: JsonFile(WrongModelFit, WRITER, ADVICE),
+}
+LINES: dict[str, Callable[[Any], str]] = {
+    FITS: fit_line,
+    CHAINS: chain_line,
+    WRONG_MODEL: wrong_model.fit_line,
 }
 WORDS = {FITS: "fits", CHAINS: "chains", WRONG_MODEL: "fits"}  # for what a stage makes
 PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
@@ -75,38 +80,12 @@ IDENTITY_FILE = JsonFile(Identity, WRITER, "name another folder")
 
 
 @dataclasses.dataclass(frozen=True)
-class CalibrationProgress:
-    """How far a calibration is."""
-
-    replicate: int
-    """That is being made, or was finished last by a cluster, from 1."""
-    replicates: int
-    stage: str
-    """What is being done for it."""
-    elapsed: float
-    """s, of this call."""
-    remaining: float
-    """s, estimated; NaN before the first fit, or chain, of this call is finished."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Calibration:
     """Finished replicates, in the order of their numbers."""
 
     fits: list[ReplicateFit]
     chains: list[ReplicateChain]
     """None, or as many as there are fits."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Observers:
-    """What is called while a calibration goes on."""
-
-    progress: Callable[[CalibrationProgress], None] = lambda report: None
-    on_fit: Callable[[ReplicateFit], object] = lambda fitted: None
-    """With each new fit."""
-    on_chain: Callable[[ReplicateChain], object] = lambda chain: None
-    """With each new chain."""
 
 
 def calibrate(
@@ -118,7 +97,6 @@ def calibrate(
     chains: bool = False,
     noise_factor: float = 1.0,
     client: "Client | None" = None,
-    observers: Observers = Observers(),  # noqa: B008
 ) -> Calibration:
     """Makes the replicates that a folder does not hold yet: first all fits, then all chains.
 
@@ -132,7 +110,6 @@ def calibrate(
         chains: whether each posterior is sampled, too.
         noise_factor: how much larger the simulated noise is than the experiment says.
         client: of the Dask cluster that computes. None computes in this process.
-        observers: what is called meanwhile.
 
     Raises:
         ValueError: there is not one replicate; the noise is not positive; the folder holds
@@ -140,13 +117,13 @@ def calibrate(
     """
     _begin(folder, replicates, _identity(experiment, problem, noise_factor))
     names = problem.space.names
-    stage = functools.partial(_Stage, folder, replicates, client, observers.progress, names)
+    stage = functools.partial(_Stage, folder, replicates, client, names)
     fit = functools.partial(fit_replicate, problem, experiment, noise_factor=noise_factor)
-    fits = stage(FITS).run(fit, range(replicates), observers.on_fit)
+    fits = stage(FITS).run(fit, range(replicates))
     if not chains:
         return Calibration(fits, [])
     sample = functools.partial(sample_replicate, problem, experiment, noise_factor=noise_factor)
-    return Calibration(fits, stage(CHAINS).run(sample, fits, observers.on_chain))
+    return Calibration(fits, stage(CHAINS).run(sample, fits))
 
 
 def calibrate_wrong_model(
@@ -158,8 +135,6 @@ def calibrate_wrong_model(
     *,
     noise_factor: float = 1.0,
     client: "Client | None" = None,
-    progress: Callable[[CalibrationProgress], None] = lambda report: None,
-    on_fit: Callable[[WrongModelFit], object] = lambda fitted: None,
 ) -> list[WrongModelFit]:
     """Makes the replicates that a folder does not hold yet, of motion that another system makes.
 
@@ -171,8 +146,6 @@ def calibrate_wrong_model(
         replicates: number of truths.
         noise_factor: how much larger the errors of the captures are than usual.
         client: as for `calibrate`.
-        progress: called meanwhile.
-        on_fit: called with each new fit.
 
     Raises:
         ValueError: as `calibrate`, or no frame is held out.
@@ -184,9 +157,9 @@ def calibrate_wrong_model(
         )
     identity = _identity(experiment, problem, noise_factor)
     _begin(folder, replicates, {**identity, "truth": identity_of(truth)})
-    stage = _Stage(folder, replicates, client, progress, problem.space.names, WRONG_MODEL)
+    stage = _Stage(folder, replicates, client, problem.space.names, WRONG_MODEL)
     fit = functools.partial(fit_wrong_model, problem, experiment, truth.ik)
-    return stage.run(functools.partial(fit, noise_factor=noise_factor), range(replicates), on_fit)
+    return stage.run(functools.partial(fit, noise_factor=noise_factor), range(replicates))
 
 
 def _begin(folder: Path | None, replicates: int, identity: Identity) -> None:
@@ -207,23 +180,16 @@ class _Stage:
     folder: Path | None
     replicates: int
     client: "Client | None"
-    progress: Callable[[CalibrationProgress], None]
     parameters: Sequence[str]
     """Their names."""
     name: str
 
-    def run(
-        self,
-        make: Callable[..., Result],
-        arguments: Sequence[Any],
-        on_result: Callable[[Result], object],
-    ) -> list[Result]:
+    def run(self, make: Callable[[Any], Result], arguments: Sequence[Any]) -> list[Result]:
         """The results of all replicates; those that the folder has are not made again.
 
         Args:
-            make: makes one from its argument; takes `progress`, too.
+            make: makes one from its argument.
             arguments: of each replicate.
-            on_result: called with each new result.
         """
         other = f"not {WRITER}: it is of replicate {{number}}"
         store: Store[Any] = Store(FILES[self.name], self.folder, other, self._check)
@@ -231,56 +197,29 @@ class _Stage:
         stored = [store.read(path, {"number": number}) for number, path in enumerate(paths)]
         results: dict[int, Result] = {n: row for n, row in enumerate(stored) if row is not None}
         missing = [number for number in range(self.replicates) if number not in results]
-        computed = self._compute_here if self.client is None else self._compute_on_cluster
         title = f"Making the {WORDS[self.name]} of {self.replicates} replicates"
         with activity.announced(title, self.replicates, done=len(results)) as making:
-            for number, result in computed(make, arguments, missing):
+            for number, call in self._calls(make, arguments, missing):
+                with error_context(f"replicate {number + 1}"):
+                    result = call()
                 store.write(paths[number], result)
                 results[number] = result
-                on_result(result)
+                activity.report(result)
+                activity.log(LINES[self.name](result))
                 making.advance()
         return [results[number] for number in range(self.replicates)]
 
-    def _compute_here(
-        self, make: Callable[..., Result], arguments: Sequence[Any], missing: Sequence[int]
-    ) -> Iterator[tuple[int, Result]]:
-        began = time.monotonic()
-        for done, number in enumerate(missing):
-            report = self._reporter(number, done, len(missing), began)
-            with error_context(f"replicate {number + 1}"):
-                result = make(arguments[number], progress=report)
-            yield number, result
-
-    def _compute_on_cluster(
-        self, make: Callable[..., Result], arguments: Sequence[Any], missing: Sequence[int]
-    ) -> Iterator[tuple[int, Result]]:
-        assert self.client is not None
-        began = time.monotonic()
+    def _calls(
+        self, make: Callable[[Any], Result], arguments: Sequence[Any], missing: Sequence[int]
+    ) -> Iterator[tuple[int, Callable[[], Result]]]:
+        """What to call for each missing replicate, and its number; as they end on a cluster."""
+        if self.client is None:
+            for number in missing:
+                yield number, functools.partial(make, arguments[number])
+            return
         wanted = [arguments[number] for number in missing]
-        computed = cluster.compute(self.client, make, wanted)
-        for done, (index, future) in enumerate(computed, start=1):
-            number, elapsed = missing[index], time.monotonic() - began
-            with error_context(f"replicate {number + 1}"):
-                result = future.result()
-            left = elapsed / done * (len(missing) - done)
-            stage = f"{done} of {len(missing)} {WORDS[self.name]} done"
-            self.progress(CalibrationProgress(number + 1, self.replicates, stage, elapsed, left))
-            yield number, result
-
-    def _reporter(
-        self, number: int, done: int, missing: int, began: float
-    ) -> Callable[[Progress | SamplingProgress], None]:
-        """Turns reports of a fit or a chain into reports of the calibration."""
-        finished = time.monotonic() - began
-        remaining = finished / done * (missing - done) if done else math.nan
-
-        def report(inner: Progress | SamplingProgress) -> None:
-            elapsed = time.monotonic() - began
-            left = remaining - (elapsed - finished)
-            stage = inner.stage if isinstance(inner, Progress) else f"chain, step {inner.step}"
-            self.progress(CalibrationProgress(number + 1, self.replicates, stage, elapsed, left))
-
-        return report
+        for index, future in cluster.compute(self.client, make, wanted):
+            yield missing[index], future.result
 
     def _check(self, result: Mapping[str, Any]) -> None:
         """Raises ValueError for a result of other parameters, or one that contradicts itself."""

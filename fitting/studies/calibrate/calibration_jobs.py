@@ -1,6 +1,5 @@
 """The job that asks whether what fits and posteriors say of an experiment is true."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,14 +8,13 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import load_clips, make_problem, problem_from_clips
 from fitting.experiment.systems import without_own_root
-from fitting.runtime import cluster
+from fitting.runtime import activity, cluster
 from fitting.runtime.precision import in_float64
-from fitting.studies.output import Log, output_folder, publish, silent
+from fitting.studies.output import output_folder, publish
 from fitting.studies.translation import load_named_system
 
 from . import calibration, calibration_report, wrong_model, wrong_model_report
 from .assessment import Assessment, assess
-from .calibration import CalibrationProgress, Observers
 from .wrong_model import WrongModelAssessment
 
 
@@ -30,8 +28,6 @@ def calibrate(
     noise_factor: float = 1.0,
     workers: int = 0,
     scheduler: str | None = None,
-    progress: Callable[[CalibrationProgress], None] = lambda report: None,
-    log: Log = silent,
 ) -> Assessment:
     """Fits an experiment to motion simulated from random truths, and judges what the fits say.
 
@@ -49,8 +45,6 @@ def calibrate(
             notice, or estimate it.
         workers: processes on this machine that compute; 0 computes in this process.
         scheduler: address of the scheduler of a Dask cluster that computes instead.
-        progress: called as fits and chains go on.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: the experiment is wrong or does not fit its clips; it is one whose noise cannot
@@ -62,20 +56,17 @@ def calibrate(
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)
-        log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
-        observers = Observers(
-            progress,
-            lambda fitted: log(calibration_report.fit_line(fitted)),
-            lambda chain: log(calibration_report.chain_line(chain)),
+        activity.log(
+            f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}"
         )
         with cluster.connect(workers, scheduler) as client:
             made = calibration.calibrate(
                 experiment, problem, folder, replicates,
-                chains=chains, noise_factor=noise_factor, client=client, observers=observers,
+                chains=chains, noise_factor=noise_factor, client=client,
             )  # fmt: skip
         assessment = assess(made)
         document = calibration_report.document(experiment, made, assessment)
-        publish(log, folder, document)
+        publish(folder, document)
         return assessment
 
 
@@ -89,8 +80,6 @@ def calibrate_wrong_model(
     noise_factor: float = 1.0,
     workers: int = 0,
     scheduler: str | None = None,
-    progress: Callable[[CalibrationProgress], None] = lambda report: None,
-    log: Log = silent,
 ) -> WrongModelAssessment:
     """Fits an experiment to motion that another system makes, and judges what the fits say.
 
@@ -106,8 +95,6 @@ def calibrate_wrong_model(
         noise_factor: how much larger the errors of the captures are than usual.
         workers: as for `calibrate`.
         scheduler: as for `calibrate`.
-        progress: called as fits go on.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: as `calibrate`; there is no such system; no frame is held out.
@@ -122,14 +109,13 @@ def calibrate_wrong_model(
         if any(clip.root.rise is not None for clip in clips):
             system = replace(system, ik=without_own_root(system.ik))
         problem = problem_from_clips(experiment, clips)
-        log(f"{replicates} motions of {system.name}, fitted by {experiment.preset}")
+        activity.log(f"{replicates} motions of {system.name}, fitted by {experiment.preset}")
         with cluster.connect(workers, scheduler) as client:
             fits = calibration.calibrate_wrong_model(
                 experiment, problem, system, folder, replicates,
-                noise_factor=noise_factor, client=client, progress=progress,
-                on_fit=lambda fitted: log(wrong_model_report.fit_line(fitted)),
+                noise_factor=noise_factor, client=client,
             )  # fmt: skip
         assessment = wrong_model.assess(fits)
         document = wrong_model_report.document(experiment, system.name, fits, assessment)
-        publish(log, folder, document)
+        publish(folder, document)
         return assessment

@@ -17,9 +17,9 @@ from fitting.report.formatting import Table, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, styled
 from fitting.studies.fit.sentences import listed
 
-from .assessment import FAMILY_LEVEL, FIT_LEVEL, IN_VALLEY, NEAR, SAME_VALLEY, Assessment, summarise
+from .assessment import FAMILY_LEVEL, FIT_LEVEL, IN_VALLEY, NEAR, Assessment, summarise
 from .calibration import Calibration
-from .replicates import DRAWS, ReplicateChain, ReplicateFit
+from .replicates import DRAWS, SAME_VALLEY, ReplicateFit
 
 NUMBERS, SUMMARY = "calibration.json", "summary.md"
 RANKS, RECOVERY = "ranks.png", "recovery.png"
@@ -40,24 +40,6 @@ BINS = {100: 20, 0: 10}  # of a histogram, from so many replicates on
 BAND = "#dddddd"
 
 WIDE = 0.2  # of bounds, from which being inside them proves little
-
-
-def fit_line(fitted: ReplicateFit) -> str:
-    """A finished fit in one line, for the terminal."""
-    gap = fitted["cost"] - fitted["truth_valley_cost"]
-    found = "the truth's valley" if gap <= SAME_VALLEY else f"a valley {gap:.1f} above the truth's"
-    return (
-        f"replicate {fitted['number'] + 1}: {found}, {fitted['agreeing']} of {fitted['starts']} "
-        f"starts agree{'' if fitted['converged'] else ', not converged'}; {fitted['seconds']:.1f} s"
-    )
-
-
-def chain_line(chain: ReplicateChain) -> str:
-    """A finished chain in one line, for the terminal."""
-    return (
-        f"replicate {chain['number'] + 1}: chain with {chain['draws']} independent draws"
-        f"{'' if chain['converged'] else ', not converged'}; {chain['seconds']:.0f} s"
-    )
 
 
 def explanation(assessment: Assessment) -> str:

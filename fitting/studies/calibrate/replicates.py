@@ -5,7 +5,6 @@ to be is plain data, which JSON holds without loss.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Annotated, NamedTuple, NotRequired, TypedDict
 
 import jax.numpy as jnp
@@ -17,14 +16,13 @@ from fitting.experiment.experiment import Experiment
 from fitting.inference.noise import NoiseModel, noise_of, with_noise
 from fitting.inference.optimise import descent
 from fitting.inference.optimise.solution import (
-    Progress,
     Search,
     SearchSettings,
     SearchState,
     StepsUsedUp,
 )
 from fitting.inference.profiles.profile import Profile, level_of
-from fitting.inference.sample.posterior import Posterior, SamplingProgress
+from fitting.inference.sample.posterior import Posterior
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
 from fitting.problem.space import FreeParameter, to_fractions
@@ -37,6 +35,7 @@ from fitting.studies.sample.sample import sample_around, with_open_noise
 DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
 LEVELS = (0.5, 0.8, 0.95)  # of a posterior's central intervals
 LOG_PROBABILITY = "log-probability"  # ranked beside the parameters
+SAME_VALLEY = 3.0  # of cost, above the lowest that a descent from the truth reaches
 
 
 class Truth(NamedTuple):
@@ -106,7 +105,6 @@ def fit_replicate(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     number: int,
-    progress: Callable[[Progress], None] | None = None,
     noise_factor: float = 1.0,
 ) -> ReplicateFit:
     """Fits a replicate as `jaxik fit` does, and descends from its truth.
@@ -115,7 +113,6 @@ def fit_replicate(
         problem: of the experiment.
         experiment: its settings of the search, and the seed.
         number: of the replicate, from 0.
-        progress: called as the search goes on.
         noise_factor: how much larger the simulated noise is than what the problem assumes.
 
     Raises:
@@ -124,7 +121,7 @@ def fit_replicate(
     """
     truth = draw_truth(problem, experiment, number)
     simulated = _simulated(problem, truth, noise_factor)
-    fitted = fit_simulated(simulated, dataclasses.replace(experiment, seed=truth.seed), progress)
+    fitted = fit_simulated(simulated, dataclasses.replace(experiment, seed=truth.seed))
     values = np.asarray(problem.space.values(truth.u))
     profiles = fitted.identifiability.profiles
     levels = [
@@ -144,26 +141,42 @@ def fit_replicate(
 def fit_simulated(
     simulated: Problem[jaxik.FootIK],
     experiment: Experiment,
-    progress: Callable[[Progress], None] | None = None,
 ) -> Fit:
     """Fits simulated motion as `jaxik fit` does.
 
     Args:
         simulated: the problem of the experiment, with this motion.
         experiment: its settings of the search, with the seed of the replicate.
-        progress: called as the search goes on.
 
     Raises:
         KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
         ValueError: the fit cannot be assessed.
     """
-    simulated, solution = search_with_noise(simulated, experiment, progress)
+    simulated, solution = search_with_noise(simulated, experiment)
     if solution.interrupted:
         raise KeyboardInterrupt
-    fitted = assess_solution(experiment, simulated, solution, progress)
+    fitted = assess_solution(experiment, simulated, solution)
     if fitted.solution.interrupted:
         raise KeyboardInterrupt
     return fitted
+
+
+def fit_line(fitted: ReplicateFit) -> str:
+    """A finished fit in one line, for the terminal."""
+    gap = fitted["cost"] - fitted["truth_valley_cost"]
+    found = "the truth's valley" if gap <= SAME_VALLEY else f"a valley {gap:.1f} above the truth's"
+    return (
+        f"replicate {fitted['number'] + 1}: {found}, {fitted['agreeing']} of {fitted['starts']} "
+        f"starts agree{'' if fitted['converged'] else ', not converged'}; {fitted['seconds']:.1f} s"
+    )
+
+
+def chain_line(chain: ReplicateChain) -> str:
+    """A finished chain in one line, for the terminal."""
+    return (
+        f"replicate {chain['number'] + 1}: chain with {chain['draws']} independent draws"
+        f"{'' if chain['converged'] else ', not converged'}; {chain['seconds']:.0f} s"
+    )
 
 
 def outcome(number: int, fitted: Fit) -> Outcome:
@@ -188,7 +201,6 @@ def sample_replicate(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     fitted: ReplicateFit,
-    progress: Callable[[SamplingProgress], None] | None = None,
     noise_factor: float = 1.0,
 ) -> ReplicateChain:
     """Samples the posterior of a replicate as `jaxik sample` does, around its fit.
@@ -203,7 +215,7 @@ def sample_replicate(
     own = dataclasses.replace(experiment, seed=truth.seed)
     if "noise" in fitted:
         simulated = with_noise(simulated, NoiseModel(**fitted["noise"]))
-    posterior = sample_around(fitted["parameters"], simulated, own, None, progress)
+    posterior = sample_around(fitted["parameters"], simulated, own)
     if posterior.interrupted:
         raise KeyboardInterrupt
     draws = independent_draws(posterior)

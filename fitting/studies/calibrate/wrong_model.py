@@ -17,7 +17,7 @@ without its noise and jumps.
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict, cast
 
 import equinox as eqx
@@ -31,9 +31,8 @@ from fitting.clips import contacts, edit
 from fitting.experiment import systems
 from fitting.experiment.experiment import Experiment
 from fitting.inference import sensitivity
-from fitting.inference.optimise.solution import Progress
 from fitting.inference.proportions import Proportion, proportion
-from fitting.motion.goodness import CLOSE, UNSEEN, Distances, Kinds, Motion, Part
+from fitting.motion.goodness import CLOSE, UNSEEN, Distances, Kinds, Motion, Part, size
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from fitting.problem.simulation import displaced, with_motion_of
@@ -142,7 +141,6 @@ def fit_wrong_model(
     experiment: Experiment,
     truth: jaxik.FootIK,
     number: int,
-    progress: Callable[[Progress], None] | None = None,
     noise_factor: float = 1.0,
 ) -> WrongModelFit:
     """Fits the motion of another system, captured with errors, as `jaxik fit` does.
@@ -152,7 +150,6 @@ def fit_wrong_model(
         experiment: its settings of the search, and the seed.
         truth: the other system, around which the truth of the replicate is drawn.
         number: of the replicate, from 0.
-        progress: called as the search goes on.
         noise_factor: how much larger the errors are than usual.
 
     Raises:
@@ -168,7 +165,7 @@ def fit_wrong_model(
     lasting = with_errors(made, lasting_sizes, masked, copy.deepcopy(random))
     captured = with_errors(made, sizes, masked, random)
     own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
-    fitted = fit_simulated(captured, own, progress)
+    fitted = fit_simulated(captured, own)
     return {
         **outcome(number, fitted),
         "truth_values": values,
@@ -306,6 +303,19 @@ def is_true(fit: WrongModelFit) -> bool:
 def distances_of(judgement: Judgement) -> Distances:
     """The distances as they were before a file held them."""
     return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], judgement["distances"]))
+
+
+def fit_line(fitted: WrongModelFit) -> str:
+    """A finished fit in one line, for the terminal."""
+    distances = distances_of(fitted["captured"])
+    motions = distances.parts["held_out"]
+    kept = "" if distances.better == "fitted" else ", not kept"
+    return (
+        f"replicate {fitted['number'] + 1}: {word(fitted['captured'])}"
+        f"{'' if is_true(fitted) else ', which is not true'}{kept}; held out: ankles "
+        f"{size('ankle', motions['fitted']['ankle'])}, without foot IK "
+        f"{size('ankle', motions['animation']['ankle'])}; {fitted['seconds']:.1f} s"
+    )
 
 
 def summarise(assessment: WrongModelAssessment) -> dict[str, Any]:

@@ -16,9 +16,7 @@ from .wrong_model import (
     WrongModelAssessment,
     WrongModelFit,
     distances_of,
-    is_true,
     summarise,
-    word,
 )
 
 MOTIONS = {
@@ -38,19 +36,6 @@ LIMITS = [
     "worse one, or a person who walks as no system does, may leave more.",
     "A part that is held out goes on with the same walk over the same ground.",
 ]
-
-
-def fit_line(fitted: WrongModelFit) -> str:
-    """A finished fit in one line, for the terminal."""
-    distances = distances_of(fitted["captured"])
-    motions = distances.parts["held_out"]
-    kept = "" if distances.better == "fitted" else ", not kept"
-    return (
-        f"replicate {fitted['number'] + 1}: {word(fitted['captured'])}"
-        f"{'' if is_true(fitted) else ', which is not true'}{kept}; held out: ankles "
-        f"{size('ankle', motions['fitted']['ankle'])}, without foot IK "
-        f"{size('ankle', motions['animation']['ankle'])}; {fitted['seconds']:.1f} s"
-    )
 
 
 def sentence(assessment: WrongModelAssessment) -> str:

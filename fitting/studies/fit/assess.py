@@ -11,7 +11,7 @@ from fitting.experiment.experiment import Experiment
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import counted, fit_with_noise
 from fitting.inference.optimise.search import find_best_fit, refine
-from fitting.inference.optimise.solution import Progress, Solution
+from fitting.inference.optimise.solution import Solution
 from fitting.motion import playback
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem, digest_with
@@ -27,7 +27,6 @@ MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another s
 def search(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
-    progress: Callable[[Progress], None] | None = None,
     first: Float[np.ndarray, " free"] | None = None,
 ) -> Solution:
     """The best fit, without any estimate of how certain it is.
@@ -35,7 +34,6 @@ def search(
     Args:
         problem: the problem of the experiment.
         experiment: its settings of the search.
-        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
         first: the u from which the first descent begins; None is the experiment's.
     """
     return find_best_fit(
@@ -44,14 +42,12 @@ def search(
         starts=experiment.fit.starts,
         first=first,
         seed=experiment.seed,
-        progress=progress,
     )
 
 
 def search_with_noise(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
-    progress: Callable[[Progress], None] | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
@@ -60,11 +56,10 @@ def search_with_noise(
     Args:
         problem: the problem of the experiment.
         experiment: its settings of noise and search.
-        progress: as for `search`.
     """
-    solution = search(problem, experiment, progress)
+    solution = search(problem, experiment)
     settings, noise = experiment.fit.search, experiment.noise
-    problem, solution = fit_with_noise(problem, noise, solution, settings, progress)
+    problem, solution = fit_with_noise(problem, noise, solution, settings)
     return weighted(problem, experiment, solution), solution
 
 
@@ -95,7 +90,6 @@ def assess_solution(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     solution: Solution,
-    progress: Callable[[Progress], None] | None = None,
     on_solution: Callable[[Solution], object] = lambda solution: None,
 ) -> Fit:
     """The fit: a solution and how certain it is, or the lower one that its profiles led to.
@@ -104,7 +98,6 @@ def assess_solution(
         experiment: its settings of the search.
         problem: the problem of the experiment.
         solution: of the problem.
-        progress: called as a search goes on.
         on_solution: called with each solution before its assessment, which may fail.
 
     Raises:
@@ -120,7 +113,7 @@ def assess_solution(
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
             return fit
         first = identifiability.best_u
-        lower = _search_lower(problem, experiment, solution, first, progress)
+        lower = _search_lower(problem, experiment, solution, first)
         if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
             unmoved = dataclasses.replace(solution, interrupted=lower.interrupted)
             return dataclasses.replace(fit, solution=unmoved)
@@ -134,7 +127,6 @@ def _search_lower(
     experiment: Experiment,
     before: Solution,
     lower_u: Float[np.ndarray, " free"],
-    progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
     """The best fit from a point that is lower than a solution; steps and time add to its own.
 
@@ -145,10 +137,9 @@ def _search_lower(
         experiment: its settings of the search.
         before: the solution that is left.
         lower_u: the lower point, in u.
-        progress: called as the search goes on.
     """
     settings = experiment.fit.search
-    after = refine(problem.with_weight(1.0), before, lower_u, settings, progress)
+    after = refine(problem.with_weight(1.0), before, lower_u, settings)
     if after.interrupted or before.cost - after.cost <= settings.agreement:
         return after
-    return search(problem, experiment, progress, after.u).following(after)
+    return search(problem, experiment, after.u).following(after)

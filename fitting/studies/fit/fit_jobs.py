@@ -1,7 +1,8 @@
 """Jobs that search: a fit, its posterior, and translations between systems."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,19 +12,26 @@ import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
-from fitting.experiment.problems import ClipData, load_clips, load_known_values, problem_from_clips
+from fitting.experiment.problems import (
+    ClipData,
+    load_clips,
+    load_known_values,
+    problem_from_clips,
+    remarks,
+)
 from fitting.experiment.record_files import left_out
 from fitting.inference.noise import NoiseModel, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
-from fitting.inference.optimise.solution import Progress, Solution
-from fitting.inference.sample.posterior import Posterior, SamplingProgress
+from fitting.inference.optimise.solution import Solution
+from fitting.inference.sample.posterior import Posterior
 from fitting.problem.problem import Problem
 from fitting.report import style
 from fitting.report.document import Section, brief
 from fitting.report.formatting import joined
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
-from fitting.studies.output import Loaded, Log, log_output, output_folder, silent, unwatched
+from fitting.studies.output import log_output, output_folder
 from fitting.studies.sample import posterior_report
 from fitting.studies.sample.replay import replay
 from fitting.studies.sample.sample import SampledFit, minus_cost_at, sample_around, shown_noise
@@ -35,6 +43,14 @@ from .fit import Fit
 from .fit_motions import Rehearsal
 
 INTERRUPTED = "interrupted; assessing and writing the best point so far"
+
+
+class Loaded(NamedTuple):
+    """What a fit is about; reported before its search."""
+
+    experiment: Experiment
+    problem: Problem[jaxik.FootIK]
+    clips: tuple[ClipData, ...]
 
 
 class Shown(NamedTuple):
@@ -52,9 +68,6 @@ def fit(
     experiment: Experiment | str | Path,
     output: str | Path | None = None,
     *,
-    progress: Callable[[Progress], None] | None = None,
-    log: Log = silent,
-    loaded: Loaded = unwatched,
     report: bool = True,
 ) -> Fit:
     """Fits the free parameters of an experiment to its clips.
@@ -66,9 +79,6 @@ def fit(
     Args:
         experiment: an experiment, or the path of its file.
         output: folder for the run.
-        progress: called as the search goes on.
-        log: called with what the command line prints.
-        loaded: called with the experiment, its problem and clips, before the search.
         report: whether the folder gets tables, pictures and a page beside the numbers.
 
     Raises:
@@ -80,39 +90,33 @@ def fit(
     known_values = load_known_values(experiment)
     with output_folder(output) as run:
         experiment = with_files(experiment, run)
-        lines: list[str] = []
-        clips = load_clips(experiment, lines.append)
+        clips = load_clips(experiment)
         problem = problem_from_clips(experiment, clips)
         what = f"{len(experiment.free) or 'no'} parameters of {experiment.preset}"
         if of_captures := experiment.free_count - len(experiment.free):
             what += f" and {of_captures} of the capture"
         heading = f"fitting {what} to {len(clips)} clip(s)"
-        log("\n".join([heading, *lines, *capture_check.check(clips).lines]))
-        loaded(experiment, problem, clips)
-        checkpoints = open_checkpoints(run, experiment, problem, log)
+        lines = [heading, *remarks(clips), *capture_check.check(clips).lines]
+        activity.log("\n".join(lines))
+        activity.report(Loaded(experiment, problem, clips))
+        checkpoints = open_checkpoints(run, experiment, problem)
         rehearsal = Rehearsal(problem) if run is not None and report else None
-
-        def watch(reached: Progress) -> None:
-            if rehearsal is not None:
-                rehearsal.start()  # not before: until now, programs of the search were compiled
-            if progress is not None:
-                progress(reached)
-
         with checkpoints:
-            problem, solution = search_with_noise(problem, experiment, watch)
+            with nullcontext() if rehearsal is None else activity.watched_by(rehearsal):
+                problem, solution = search_with_noise(problem, experiment)
             if solution.interrupted:
-                log(INTERRUPTED)
+                activity.log(INTERRUPTED)
             shown = Shown(clips, known_values)
             if run is not None and report:
                 style.prepare_saving()
-            fitted = _assess_and_save(run, experiment, problem, solution, shown, progress)
-        opening = _price_of_record(fitted, progress, log)
+            fitted = _assess_and_save(run, experiment, problem, solution, shown)
+        opening = _price_of_record(fitted)
         if run is not None and report:
             fit_report.write_fit(run, fitted, opening, rehearsal=rehearsal)
         if not fitted.solution.interrupted:
             checkpoints.remove()
-        log(joined(["", fit_report.fit_text(fitted, opening)]))
-        log_output(log, run, run_folder.SUMMARY)
+        activity.log(joined(["", fit_report.fit_text(fitted, opening)]))
+        log_output(run, run_folder.SUMMARY)
         return fitted
 
 
@@ -121,8 +125,6 @@ def sample(
     fitted: Fit | str | Path,
     *,
     max_steps: int | None = None,
-    progress: Callable[[SamplingProgress], None] | None = None,
-    log: Log = silent,
 ) -> Posterior:
     """Samples the posterior around a fit; a fit with a folder has its chain and report there.
 
@@ -133,8 +135,6 @@ def sample(
     Args:
         fitted: a fit, or the folder of its run.
         max_steps: limit to the steps of the sampler over all calls, instead of the experiment's.
-        progress: called as the sampling goes on.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: the folder holds no fit, or its experiment does not fit its clips any more.
@@ -155,9 +155,9 @@ def sample(
         experiment = experiment.with_max_sample_steps(max_steps)
     with output_folder(run):
         chain = None if run is None else run / run_folder.CHAIN
-        posterior = sample_around(parameters, problem, experiment, chain, progress)
+        posterior = sample_around(parameters, problem, experiment, chain)
         if posterior.interrupted:
-            log("interrupted; summarising and writing the chain so far")
+            activity.log("interrupted; summarising and writing the chain so far")
         played = None
         try:
             if not posterior.interrupted:
@@ -170,10 +170,10 @@ def sample(
         if run is not None:
             _save_and_report(run, sampled)
             if sampled.has_lower_point and not posterior.interrupted:
-                sampled = _adopt_lower_point(run, problem, clips, sampled, log)
+                sampled = _adopt_lower_point(run, problem, clips, sampled)
                 posterior = sampled.posterior
-        log(joined(["", posterior_report.posterior_text(sampled, run)]))
-        log_output(log, run, run_folder.SUMMARY)
+        activity.log(joined(["", posterior_report.posterior_text(sampled, run)]))
+        log_output(run, run_folder.SUMMARY)
         return posterior
 
 
@@ -181,9 +181,6 @@ def sample(
 def translate(
     request: TranslationRequest,
     output: str | Path | None = None,
-    *,
-    progress: Callable[[Progress], None] | None = None,
-    log: Log = silent,
 ) -> Fit:
     """Fits the parameters of one system to the motion of another.
 
@@ -193,8 +190,6 @@ def translate(
     Args:
         request: which system is fitted to which, and on what.
         output: a new folder for the run, or that of a translation that was killed or interrupted.
-        progress: called as the search goes on.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: as `studies.translation.prepare`, or the folder holds something already.
@@ -205,43 +200,41 @@ def translate(
     with output_folder(run):
         prepared = translation.prepare(request, Path() if run is None else run)
         experiment, problem = prepared.experiment, prepared.problem
-        log(
+        activity.log(
             f"fitting {len(experiment.free)} parameters of {request.target.name} to "
             f"{request.source.name} on {len(prepared.clips)} clip(s)"
         )
         start = translation.starting_point(problem)
-        checkpoints = open_checkpoints(run, experiment, problem, log)
+        checkpoints = open_checkpoints(run, experiment, problem)
         with checkpoints:
-            solution = search(problem, experiment, progress, start)
+            solution = search(problem, experiment, start)
             if solution.interrupted:
-                log(INTERRUPTED)
+                activity.log(INTERRUPTED)
             shown = Shown(prepared.clips, has_noise=False)
             if run is not None:
                 translation.save_source(run, prepared)
                 shown = shown._replace(known_values=load_known_values(experiment))
-            fitted = _assess_and_save(run, experiment, problem, solution, shown, progress)
+            fitted = _assess_and_save(run, experiment, problem, solution, shown)
         differences = translation.differences(fitted)
         if run is not None:
             translation.write(run, prepared, fitted, differences)
         if not fitted.solution.interrupted:
             checkpoints.remove()
-        log(f"\n{solution.message} {fitted.verdict.sentence}\n")
-        log(brief([translation.opening(prepared, fitted, differences)]))
-        log_output(log, run, run_folder.SUMMARY)
+        activity.log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+        activity.log(brief([translation.opening(prepared, fitted, differences)]))
+        log_output(run, run_folder.SUMMARY)
         return fitted
 
 
-def _price_of_record(
-    fitted: Fit, progress: Callable[[Progress], None] | None, log: Log
-) -> list[Section]:
+def _price_of_record(fitted: Fit) -> list[Section]:
     """What it costs to fit only what the record holds."""
     experiment = fitted.experiment
     if not (experiment.record_only and experiment.free):
         return []
     if (names := left_out(experiment)) and not fitted.solution.interrupted:
-        log(f"what the record costs: a search in which {', '.join(names)} are free, too")
+        activity.log(f"what the record costs: a search in which {', '.join(names)} are free, too")
     try:
-        price = record_price.measure(fitted, progress)
+        price = record_price.measure(fitted)
     except KeyboardInterrupt:  # the fit is finished: its report must be written
         price = None
     return [record_price.section(experiment, price)]
@@ -257,7 +250,6 @@ def _adopt_lower_point(
     problem: Problem[jaxik.FootIK],
     clips: tuple[ClipData, ...],
     sampled: SampledFit,
-    log: Log,
 ) -> SampledFit:
     """The chain with a fit that went on from its best point, which takes the run's old fit's place.
 
@@ -267,7 +259,7 @@ def _adopt_lower_point(
     experiment, posterior = sampled.experiment, sampled.posterior
     if translation.is_translation(run):
         return sampled
-    log(
+    activity.log(
         f"the chain met a point whose cost is {posterior.improvement:.3g} lower than the fit's; "
         "the fit goes on from there"
     )
@@ -286,7 +278,7 @@ def _adopt_lower_point(
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
     fit_report.write_fit(run, fitted)
-    log(joined(["", fit_report.fit_text(fitted)]))
+    activity.log(joined(["", fit_report.fit_text(fitted)]))
     sampled = dataclasses.replace(
         sampled,
         parameters=fitted.summary["parameters"],
@@ -302,7 +294,6 @@ def _assess_and_save(
     problem: Problem[jaxik.FootIK],
     solution: Solution,
     shown: Shown,
-    progress: Callable[[Progress], None] | None,
 ) -> Fit:
     """The fit; each of its solutions is on disk before the assessment, which may fail."""
 
@@ -310,7 +301,7 @@ def _assess_and_save(
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
 
-    fitted = assess_solution(experiment, problem, solution, progress, save)
+    fitted = assess_solution(experiment, problem, solution, save)
     fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
     if run is not None:
         run_folder.save_fit(run, fitted)
@@ -318,13 +309,13 @@ def _assess_and_save(
 
 
 def open_checkpoints(
-    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
+    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK]
 ) -> Checkpoints:
     """The finished stages of a fit that was killed in this folder, and room for those of this."""
-    checkpoints = Checkpoints(run, run_folder.SEARCH, search_identity(problem, experiment), log)
+    checkpoints = Checkpoints(run, run_folder.SEARCH, search_identity(problem, experiment))
     if checkpoints.count:
         stages = f"{checkpoints.count} stages of its search"
         if checkpoints.profile_count:
             stages += f" and {checkpoints.profile_count} of its profiles"
-        log(f"a fit that was interrupted here goes on after {stages}")
+        activity.log(f"a fit that was interrupted here goes on after {stages}")
     return checkpoints

@@ -27,6 +27,7 @@ from fitting.motion.accuracy import Accuracy, Errors
 from fitting.motion.measures import PlacedMotion, place, with_soles_of
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from .fit import Fit
@@ -110,13 +111,17 @@ def saved_clips(fitted: Fit) -> dict[str, Clip]:
     return clips
 
 
-class Rehearsal:
-    """Plays the clips of a problem once, from when it is started or its results are wanted."""
+class Rehearsal(activity.Watcher):
+    """Plays the clips of a problem once, from a search's first report or when results are wanted.
+
+    Not before, as until then programs of the search are compiled. Its thread has no context, so
+    that what it compiles is not shown as what the search waits for.
+    """
 
     def __init__(self, problem: Problem[jaxik.FootIK]):
         self._problem = problem
 
-    def start(self) -> None:
+    def reported(self, result: object) -> None:
         """Begins to play, unless it has begun."""
         _ = self._future
 

@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.record_files import left_out, set_aside
-from fitting.inference.optimise.solution import Progress
 from fitting.motion import goodness, playback
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem
@@ -37,12 +36,11 @@ class RecordPrice:
 
 
 @in_float64
-def measure(fitted: Fit, progress: Callable[[Progress], None] | None = None) -> RecordPrice | None:
+def measure(fitted: Fit) -> RecordPrice | None:
     """Fits what the experiment would have free without the restriction, from where its fit ended.
 
     Args:
         fitted: the fit of a restricted experiment.
-        progress: called as the search goes on.
 
     Returns:
         None if the restriction left nothing out, or if Ctrl-C ended either search.
@@ -56,7 +54,7 @@ def measure(fitted: Fit, progress: Callable[[Progress], None] | None = None) -> 
     begin = {**whole.start, **dict(zip(fitted.solution.names, fitted.solution.values, strict=True))}
     options = dataclasses.replace(whole.fit, starts=1)
     settings = dataclasses.replace(whole, fit=options)
-    freed = search(problem, settings, progress, np.asarray(space.pack(begin)))
+    freed = search(problem, settings, np.asarray(space.pack(begin)))
     if freed.interrupted:
         return None
     before, after = _errors(fitted.problem, fitted.solution.u), _errors(problem, freed.u)

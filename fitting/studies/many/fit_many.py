@@ -8,12 +8,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
-from fitting.experiment.problems import ClipData
-from fitting.problem.problem import Problem
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Stopwatch, first_alone, waiting_for
 from fitting.runtime.plain_tree import NotPlainError
@@ -23,15 +20,14 @@ from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit
-from fitting.studies.fit.fit_jobs import fit
-from fitting.studies.output import Log, output_folder, publish, silent
+from fitting.studies.fit.fit_jobs import Loaded, fit
+from fitting.studies.output import output_folder, publish
 
 from . import many_report, many_tasks
 from .many_tasks import (
     RUNS,
     FitTask,
     ManyFits,
-    ManyProgress,
     Row,
     Tally,
     failed_row,
@@ -61,8 +57,6 @@ def fit_many(
     report: bool = True,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Callable[[ManyProgress], None] = lambda report: None,
-    log: Log = silent,
 ) -> ManyFits:
     """Fits each clip of each experiment alone, with each seed: every fit is a run folder.
 
@@ -82,8 +76,6 @@ def fit_many(
             in this process.
         scheduler: address of the scheduler of a Dask cluster that computes instead. Its machines
             need this package, and the same files under the same paths.
-        progress: called with each fit that ends.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: an experiment cannot be read; there is none, or not one seed; the folder cannot
@@ -100,20 +92,20 @@ def fit_many(
         tasks = plan(loaded, seeds, together=together)
         with activity.announced(f"Looking for finished fits among {len(tasks)}"):
             tally = Tally(folder, tasks)
-        log(many_report.plan_line(len(loaded), len(tasks), len(tally.missing), seeds))
+        activity.log(many_report.plan_line(len(loaded), len(tasks), len(tally.missing), seeds))
         if workers is None and scheduler is None:
             workers = usable_cores()
         interrupted = False
         try:
-            with _connected(len(tally.missing), workers, scheduler, log) as client:
+            with _connected(len(tally.missing), workers, scheduler) as client:
                 make = functools.partial(fit_task, folder, report=report)
-                _compute(client, make, tally, progress, log)
+                _compute(client, make, tally)
         except KeyboardInterrupt:
             interrupted = True
             tally.look_again()
-            log("interrupted; writing the table of the finished fits")
+            activity.log("interrupted; writing the table of the finished fits")
         fits = tally.fits(interrupted=interrupted)
-        _write(fits, loaded, log)
+        _write(fits, loaded)
         return fits
 
 
@@ -136,44 +128,36 @@ def _check_folder(folder: Path) -> None:
 
 @contextmanager
 def _connected(
-    missing: int, workers: int | None, scheduler: str | None, log: Log
+    missing: int, workers: int | None, scheduler: str | None
 ) -> "Iterator[Client | None]":
     """The cluster that makes the missing fits, no larger than they need; None is this process."""
     workers = min(workers or 0, missing)
     with cluster.connect(workers, scheduler if missing else None, dashboard=True) as client:
         if client is not None:
-            _log_dashboard(client, log)
+            _log_dashboard(client)
             if scheduler is not None:
-                log(_workers_line(cluster.hosts(client), scheduler))
+                activity.log(_workers_line(cluster.hosts(client), scheduler))
         yield client
 
 
-def _compute(
-    client: "Client | None",
-    make: Callable[[FitTask], Row],
-    tally: Tally,
-    progress: Callable[[ManyProgress], None],
-    log: Log,
-) -> None:
+def _compute(client: "Client | None", make: Callable[[FitTask], Row], tally: Tally) -> None:
     """Makes the missing fits, and tells of each as it ends."""
     total, missing = len(tally.tasks), tally.missing
     title = f"Making {total} fit{'s' * (total != 1)}"
     with activity.announced(title, total, done=total - len(missing)) as fitting:
         for row in _computed(client, make, missing):
             tally.add(row)
-            log(many_report.row_line(row))
-            now = tally.progress()
+            activity.log(many_report.row_line(row))
             fitting.advance()
-            activity.note(many_report.progress_line(now))
-            progress(now)
+            activity.report(row, f"{tally.failed} failed" if tally.failed else "")
 
 
-def _log_dashboard(client: "Client", log: Log) -> None:
+def _log_dashboard(client: "Client") -> None:
     """Logs where Dask shows its workers, or what is missing for that."""
     if cluster.has_dashboard():
-        log(f"Dask's dashboard: {client.dashboard_link}")
+        activity.log(f"Dask's dashboard: {client.dashboard_link}")
     else:
-        log("no dashboard, as bokeh is not installed: pip install 'jaxik[dask]'")
+        activity.log("no dashboard, as bokeh is not installed: pip install 'jaxik[dask]'")
 
 
 def _workers_line(hosts: Sequence[str], scheduler: str) -> str:
@@ -201,17 +185,16 @@ def _computed(
             yield failed_row(tasks[index], in_one_line(error))
 
 
-def _write(fits: ManyFits, experiments: Sequence[Experiment], log: Log) -> None:
+def _write(fits: ManyFits, experiments: Sequence[Experiment]) -> None:
     """The table, the picture and the page of what there is, and what the terminal shows."""
     written: Sequence[str] = ()
     if fits.rows:
         with activity.announced("Writing the table"):
             written = many_tasks.write(fits.folder, fits.rows)
         if many_tasks.PARQUET not in written:
-            log(many_tasks.MISSING)
-    publish(
-        log, fits.folder if fits.rows else None, many_report.document(fits, experiments, written)
-    )
+            activity.log(many_tasks.MISSING)
+    folder = fits.folder if fits.rows else None
+    publish(folder, many_report.document(fits, experiments, written))
 
 
 def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
@@ -248,19 +231,25 @@ def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
         return failed_row(task, in_one_line(error))
 
 
-def _fit(run: Path, experiment: Experiment, report: bool, watch: Stopwatch) -> Fit:
-    with ExitStack() as stack:
+class _Wait(activity.Watcher):
+    """Waits, once a fit has its problem, while another process compiles the same programs."""
 
-        def wait_for_programs(
-            experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
-        ) -> None:
+    def __init__(self, watch: Stopwatch, stack: ExitStack) -> None:
+        self._watch, self._stack = watch, stack
+
+    def reported(self, result: object) -> None:
+        if isinstance(result, Loaded):
+            problem = result.problem
             # A rule of the user's own is never kept, so that nobody need wait.
             with suppress(NotPlainError):
                 key = program_key(problem.residual_function, ((problem,), {}))
-                with watch.waiting():
-                    stack.enter_context(first_alone(key))
+                with self._watch.waiting():
+                    self._stack.enter_context(first_alone(key))
 
-        fitted = fit(experiment, run, loaded=wait_for_programs, report=report)
+
+def _fit(run: Path, experiment: Experiment, report: bool, watch: Stopwatch) -> Fit:
+    with ExitStack() as stack, activity.quiet(), activity.watched_by(_Wait(watch, stack)):
+        fitted = fit(experiment, run, report=report)
     if fitted.solution.interrupted:
         (run / run_folder.FIT).unlink(missing_ok=True)
         raise KeyboardInterrupt

@@ -16,7 +16,7 @@ from fitting.report.formatting import Table, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, styled
 from fitting.studies.fit.sentences import listed
 
-from .many_tasks import FittedValue, ManyFits, ManyProgress, Row
+from .many_tasks import FittedValue, ManyFits, Row
 
 SUMMARY, FIGURE = "summary.md", "fits.png"
 MANY = 50  # rows of a table for people; all are in the file
@@ -54,14 +54,6 @@ def row_line(row: Row) -> str:
     state = "" if outcome["converged"] else ", not converged"
     seconds = f", {row['effort']['seconds']:.1f} s" if "effort" in row else ""
     return f"{row['run']}: cost {number(outcome['cost'])}{seconds}{state}"
-
-
-def progress_line(progress: ManyProgress) -> str:
-    """Rate, time left and failures."""
-    failed = f", {progress.failed} failed" if progress.failed else ""
-    left = progress.remaining
-    time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
-    return f"{progress.rate:.1f} fits a minute, {time_left} left{failed}"
 
 
 def misfits(fits: ManyFits) -> int:

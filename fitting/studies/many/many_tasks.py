@@ -294,30 +294,6 @@ def _row(task: FitTask, state: Literal["finished", "failed"], error: str) -> Row
 
 
 @dataclasses.dataclass(frozen=True)
-class ManyProgress:
-    """How far many fits are; reported with each that ends."""
-
-    done: int
-    """Those of earlier calls included."""
-    total: int
-    failed: int
-    elapsed: float
-    """s, of this call."""
-    made: int
-    """In this call."""
-
-    @property
-    def rate(self) -> float:
-        """Fits a minute, in this call."""
-        return 60.0 * self.made / max(self.elapsed, 1e-9)
-
-    @property
-    def remaining(self) -> float:
-        """s, estimated; infinite before the first fit of this call is done."""
-        return 60.0 * (self.total - self.done) / self.rate if self.made else float("inf")
-
-
-@dataclasses.dataclass(frozen=True)
 class ManyFits:
     """Many fits, each with its row, in the order in which they were planned."""
 
@@ -365,24 +341,19 @@ class Tally:
         runs = [task.run.as_posix() for task in tasks]
         self._rows = dict(zip(runs, rows, strict=True))
         self._began = time.monotonic()
-        self._made = self._failed = 0
+        self._made = self.failed = 0
 
     def add(self, row: Row) -> None:
         """Takes the row of a fit that was missing."""
         self._rows[row["run"]] = row
         self._made += 1
-        self._failed += row["state"] == "failed"
+        self.failed += row["state"] == "failed"
 
     def look_again(self) -> None:
         """Takes the rows that were written and not yet told of, as an interrupt came between."""
         for task in self.missing:
             if self._rows[task.run.as_posix()] is None and (row := read_row(self.folder, task)):
                 self.add(row)
-
-    def progress(self) -> ManyProgress:
-        """How far the fits are."""
-        done = len(self.tasks) - len(self.missing) + self._made
-        return ManyProgress(done, len(self.tasks), self._failed, self._elapsed, self._made)
 
     def fits(self, *, interrupted: bool) -> ManyFits:
         """All rows there are, in the order of the tasks."""

@@ -12,9 +12,8 @@ another name.
 
 import dataclasses
 import functools
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NotRequired, TypedDict
 
@@ -36,16 +35,15 @@ from fitting.inference.mixed_model import (
 )
 from fitting.inference.noise import NoiseModel, NoiseOptions, noise_of, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
-from fitting.inference.optimise.solution import Progress
 from fitting.motion.accuracy import position_error
 from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
+from fitting.report.formatting import number
 from fitting.runtime import activity
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
-from fitting.studies.ablation import labelled
 from fitting.studies.fit.assess import search_identity, search_with_noise
 from jaxik.maths import parameter_tree
 
@@ -81,9 +79,6 @@ class Searches:
     experiment: Experiment
     folder: Path | None
     """Where they are stored; None stores none."""
-    progress: Callable[[Progress], None] | None = None
-    on_found: Callable[[Found], object] = lambda found: None
-    """Called with each new result."""
 
     def fit(
         self, name: str, problem: Problem[jaxik.FootIK], *, with_its_noise: bool = False
@@ -118,8 +113,8 @@ class Searches:
         problem: Problem[jaxik.FootIK],
         experiment: Experiment,
     ) -> Found:
-        progress = labelled(self.progress, name)
-        fitted, solution = search_with_noise(problem, experiment, progress)
+        with activity.announced(f"Fitting {name}"):
+            fitted, solution = search_with_noise(problem, experiment)
         if solution.interrupted:
             raise KeyboardInterrupt
         found: Found = {
@@ -132,8 +127,14 @@ class Searches:
         }
         if experiment.noise.estimates_any:
             found["noise"] = dataclasses.asdict(noise_of(fitted))
-        self.on_found(found)
+        activity.report(found)
+        activity.log(found_line(found))
         return found
+
+
+def found_line(found: Found) -> str:
+    """A finished search in one line, for the terminal."""
+    return f"{found['name']}: cost {number(found['cost'])}, {found['seconds']:.1f} s"
 
 
 def search_store(folder: Path | None, size: int) -> Store[Found]:
@@ -298,7 +299,6 @@ def predict(
     fit: PopulationFit,
     pooled: Float[np.ndarray, " free"],
     clip: int,
-    progress: Callable[[int, float], None],
 ) -> Float[np.ndarray, " free"]:
     """The parameters of a clip, in u, as the population of the others expects them.
 
@@ -308,11 +308,10 @@ def predict(
         fit: of all clips, where the search begins.
         pooled: the best fit of all clips but this one, where it begins too; in u.
         clip: the one that is left out.
-        progress: as for `fit_population`.
     """
     rest = [problem for c, problem in enumerate(problems) if c != clip]
     starts = [np.tile(pooled, (len(rest), 1)), np.delete(fit.clips, clip, axis=0)]
-    return fit_population(rest, grouping.without(clip), starts, progress).predict(grouping, clip)
+    return fit_population(rest, grouping.without(clip), starts).predict(grouping, clip)
 
 
 def error_at(problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"]) -> float:
@@ -407,8 +406,6 @@ def fit_clips_and_population(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     folder: Path | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    on_found: Callable[[Found], object] = lambda found: None,
 ) -> Population:
     """Fits each clip alone, all pooled, the population, and all without each clip in turn.
 
@@ -419,8 +416,6 @@ def fit_clips_and_population(
         experiment: with parameters that vary between clips or subjects.
         problem: of the experiment.
         folder: where finished searches are kept; what it has is not repeated. None keeps none.
-        progress: called as a search goes on; its stage names what is fitted.
-        on_found: called with each new search.
 
     Raises:
         KeyboardInterrupt: it was interrupted; finished searches are in the folder.
@@ -437,7 +432,7 @@ def fit_clips_and_population(
     )
     grouping = experiment.hierarchy.grouping(names, clips, subjects)
     check_thresholds(problem.space, grouping)
-    searches = Searches(experiment, folder, progress, on_found)
+    searches = Searches(experiment, folder)
     problems, alone = [], []
     for name, scene in zip(clips, problem.data, strict=True):
         single = eqx.tree_at(lambda p: p.data, problem, (scene,))
@@ -447,19 +442,16 @@ def fit_clips_and_population(
     pooled_problem = _joined(problem, problems)
     _, pooled = searches.fit(EVERYTHING, pooled_problem)
     alone_u, pooled_u = np.array([found["u"] for found in alone]), np.array(pooled["u"])
-    rounds = _Rounds(progress)
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     with activity.announced("Fitting the population"):
-        fit = fit_population(problems, grouping, starts, rounds.of("population"))
+        fit = fit_population(problems, grouping, starts)
     errors, others = [], []
     for c, name in enumerate(clips):
         rest = f"{EVERYTHING} but {name}"
         others.append(searches.fit(rest, without_clip(pooled_problem, c))[1])
         others_u = np.array(others[c]["u"])
         with activity.announced(f"Predicting {name} from the others"):
-            expected = predict(
-                problems, grouping, fit, others_u, c, rounds.of(f"{rest}, population")
-            )
+            expected = predict(problems, grouping, fit, others_u, c)
             points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
             errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
     levels = [experiment.hierarchy.level(name) for name in names]
@@ -488,21 +480,3 @@ def _joined(
     tails = jnp.mean(jnp.stack([single.tails for single in problems]))
     scenes = tuple(scene for single in problems for scene in single.data)
     return eqx.tree_at(lambda p: (p.data, p.weight, p.tails), problem, (scenes, fraction, tails))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Rounds:
-    """Reports the rounds of a population's fit as a search does its steps."""
-
-    progress: Callable[[Progress], None] | None
-    began: float = dataclasses.field(default_factory=time.perf_counter)
-
-    def of(self, name: str) -> Callable[[int, float], None]:
-        """What to call after each round."""
-
-        def report(rounds: int, cost: float) -> None:
-            if self.progress is not None:
-                elapsed = time.perf_counter() - self.began
-                self.progress(Progress(name, 0, rounds, cost, cost, elapsed))
-
-        return report

@@ -1,7 +1,6 @@
 """The report of a population: what its clips and subjects have in common, and how they differ."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,18 +17,17 @@ from fitting.experiment.experiment_files import experiment_to_toml, load_experim
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import make_problem
 from fitting.experiment.systems import Preset
-from fitting.inference.optimise.solution import Progress
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, interval, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, styled
-from fitting.runtime import files
+from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.sentences import listed
-from fitting.studies.output import Log, output_folder, publish, silent
+from fitting.studies.output import output_folder, publish
 
-from .population import Estimate, Found, ParameterEstimates, Population, fit_clips_and_population
+from .population import Estimate, ParameterEstimates, Population, fit_clips_and_population
 
 NUMBERS, SUMMARY, FIGURE = "population.json", "summary.md", "population.png"
 FEW = 5  # clips or subjects, from which little is known of a spread
@@ -58,11 +56,6 @@ CM = 100.0  # in a metre
 APART = 0.16  # of a row, from its middle to an estimate
 COLOURS = dict(zip(ERROR_NAMES, (BEFORE, CAPTURED, AFTER, STAGES[1], STAGES[4]), strict=True))
 PANELS_PER_ROW = 3
-
-
-def found_line(found: Found) -> str:
-    """A finished search in one line, for the terminal."""
-    return f"{found['name']}: cost {number(found['cost'])}, {found['seconds']:.1f} s"
 
 
 def document(population: Population) -> Document:
@@ -324,9 +317,6 @@ def _limits(population: Population) -> Section:
 def population(
     experiment: Experiment | str | Path,
     output: str | Path | None = None,
-    *,
-    progress: Callable[[Progress], None] | None = None,
-    log: Log = silent,
 ) -> Population:
     """Fits the clips of an experiment each alone, all pooled, and as a population.
 
@@ -337,8 +327,6 @@ def population(
     Args:
         experiment: an experiment, or the path of its file.
         output: folder for the searches and the report.
-        progress: called as a search goes on; its stage names what is fitted.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: the experiment is wrong, fits a capture, too, nothing in it varies, or a
@@ -351,20 +339,14 @@ def population(
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)
-        log(
+        activity.log(
             f"fitting {problem.space.size} parameters of {experiment.preset} to "
             f"{len(experiment.clips)} clips, {len(experiment.hierarchy.varying)} of them varying"
         )
-        fitted = fit_clips_and_population(
-            experiment,
-            problem,
-            folder,
-            progress,
-            lambda found: log(found_line(found)),
-        )
+        fitted = fit_clips_and_population(experiment, problem, folder)
         if folder is not None:
             _write_systems(folder, fitted)
-        publish(log, folder, document(fitted))
+        publish(folder, document(fitted))
         return fitted
 
 

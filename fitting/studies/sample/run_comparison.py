@@ -15,7 +15,7 @@ from fitting.report.formatting import Table
 from fitting.runtime import activity, files
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.sentences import listed
-from fitting.studies.output import Log, output_folder, publish, silent
+from fitting.studies.output import output_folder, publish
 
 TABLE, NUMBERS = "runs.md", "runs.json"
 
@@ -203,15 +203,12 @@ def findings(runs: Sequence[ComparedRun]) -> list[Finding]:
     ]
 
 
-def compare_runs(
-    runs: Sequence[str | Path], output: str | Path | None = None, *, log: Log = silent
-) -> list[ComparedRun]:
+def compare_runs(runs: Sequence[str | Path], output: str | Path | None = None) -> list[ComparedRun]:
     """Compares sampled runs of several systems by what they predict of the same motion.
 
     Args:
         runs: folders that `fit` and `sample` have filled.
         output: folder for the table, the numbers and the page.
-        log: called with what the command line prints.
 
     Raises:
         ValueError: as `compare_posteriors`, or the folder cannot be
@@ -223,5 +220,5 @@ def compare_runs(
         if folder is not None:
             numbers = json.dumps([asdict(run) for run in compared], indent=2)
             files.write_text(folder / NUMBERS, numbers + "\n")
-        publish(log, folder, document(compared))
+        publish(folder, document(compared))
         return compared

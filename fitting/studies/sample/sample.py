@@ -1,7 +1,7 @@
 """Sampling the posterior around a fit, and what it makes of the prior."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from fitting.inference.noise import draw_sigmas, measured, with_unknown_sigmas
 from fitting.inference.sample.blocks import LeaveOneOut, leave_one_out
 from fitting.inference.sample.posterior import (
     Posterior,
-    SamplingProgress,
     WalkerStart,
     minus_cost,
     sample_posterior,
@@ -77,7 +76,6 @@ def sample_around(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     chain: Path | None = None,
-    progress: Callable[[SamplingProgress], None] | None = None,
 ) -> Posterior:
     """Samples the posterior of a problem.
 
@@ -87,7 +85,6 @@ def sample_around(
             squares as loss; a robust loss, and correlations, keep the estimated ones.
         experiment: its settings of the sampler.
         chain: file that keeps the chain; one that is there is continued. None keeps it in memory.
-        progress: called as the sampling goes on; KeyboardInterrupt keeps the chain so far.
 
     Raises:
         ValueError: the fit has other parameters than the problem, or the file holds another chain.
@@ -102,7 +99,7 @@ def sample_around(
     start = walker_start(parameters, problem.space)
     problem = with_open_noise(problem, experiment)
     posterior = sample_posterior(
-        problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
+        problem, start, experiment.sample, seed=experiment.seed, path=chain
     )
     if problem.unknown_sigmas is None:
         return posterior
