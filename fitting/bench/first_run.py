@@ -1,22 +1,17 @@
 """What a newcomer waits for: a first fit, a first posterior, the first cells of a notebook.
 
-`python -m fitting.bench.first_run KIND FOLDER` does one of them in the example in the
-folder, as a command or a notebook would, and prints the seconds until the first number and until
-the end.
+Each is done in the example in a folder, as a command or a notebook would, in a process of its own.
 """
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 from fitting.runtime import activity
 
-from .measurement import FigureSpec, Measurement
+from .measurement import Measurement, call_in_process
 from .workloads import Sizes
 
 EXAMPLE, RUN = "uneven_walk", "run"  # the main job of the README, and the folder of its run
@@ -45,21 +40,16 @@ def first_run(measurement: Measurement, sizes: Sizes) -> None:
                         measurement.samples.setdefault(f"whole {name}", []).append(seconds["end"])
     for state, at_most in ENDS.items():
         for kind, what in WAITS.items():
-            spec = FigureSpec(what=f"{what}, {state} cache", unit="s")
-            measurement.add_timing(f"{kind}, {state} cache", spec)
-        spec = FigureSpec(what=f"… the whole fit, {state} cache", unit="s", at_most=at_most)
-        measurement.add_timing(f"whole fit, {state} cache", spec)
+            measurement.add_timing(f"{kind}, {state} cache", f"{what}, {state} cache")
+        what = f"… the whole fit, {state} cache"
+        measurement.add_timing(f"whole fit, {state} cache", what, at_most=at_most)
 
 
 def _in_process(kind: str, folder: Path, variables: dict[str, str]) -> dict[str, float]:
     """Seconds of a new process until its first number and its end, imports included."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    command = [sys.executable, "-m", "fitting.bench.first_run", kind, str(folder)]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | variables
     start = time.time()
-    finished = subprocess.run(
-        command, env=environment | variables, check=True, capture_output=True, text=True
-    )
-    first = float(json.loads(finished.stdout.splitlines()[-1]))
+    first = call_in_process(wait, kind, str(folder), environment=environment)
     return {"first": first - start, "end": time.time() - start}
 
 
@@ -103,17 +93,13 @@ class _Clock(activity.Watcher):
             self.times.append(time.time())
 
 
-def main() -> None:
-    """Does one of the jobs and prints the time of its first number, in seconds since 1970."""
+def wait(kind: str, folder: str) -> float:
+    """Does one of the jobs; the time of its first number, in seconds since 1970."""
     from fitting.runtime import cache_folder, xla
 
     xla.configure_xla()
     cache_folder.use_default()
     jobs = {"fit": fit, "sample": sample, "notebook": notebook}
     with activity.watched_by(clock := _Clock()):
-        jobs[sys.argv[1]](Path(sys.argv[2]))
-    print(f"\n{clock.times[0]}")
-
-
-if __name__ == "__main__":
-    main()
+        jobs[kind](Path(folder))
+    return clock.times[0]

@@ -1,22 +1,17 @@
 """Benchmarks of fits: the Jacobian, a warm and a cold fit, and the posterior, in 64 bits."""
 
 import dataclasses
+import functools
 import itertools
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Mapping
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.clips import load_clip, save_clip
-from fitting.ground.meshes import load_terrain, save_mesh
 from fitting.inference.optimise.search import find_best_fit
 from fitting.inference.optimise.solution import Solution
 from fitting.inference.sample.blocks import SamplerSettings
@@ -25,13 +20,11 @@ from fitting.problem.problem import Problem
 from fitting.runtime.threads import usable_cores
 
 from . import kernels, workloads
-from .measurement import Call, FigureSpec, Measurement, time_calls
+from .measurement import Call, Measurement, call_in_process, time_calls
 from .workloads import Sizes
 
 SCIPY = {"SciPy with our slopes": True, "SciPy with differences": False}  # our Jacobian or not
 FULL_POSTERIOR = 64 * 1000  # log-probabilities for which there is a target; fewer have none
-
-CLIPS, GROUND = ("reference.npz", "base.npz"), "ground.ply"
 
 
 def _residuals(problem: Problem, u: jax.Array) -> jax.Array:
@@ -56,14 +49,12 @@ def jacobian(measurement: Measurement, sizes: Sizes) -> None:
     measurement.time_in_turns(calls)
     for floats in sizes.floats:
         rows, slopes = f"rows, {floats}", f"slopes, {floats}"
-        spec = FigureSpec(what=rows, unit="ms", scale=1e3, floats=floats)
-        measurement.add_timing(rows, spec)
+        measurement.add_timing(rows, rows, "ms", floats=floats)
         what = f"rows and slopes, {floats}"
-        measurement.add_timing(slopes, dataclasses.replace(spec, what=what, at_most=25.0))
+        measurement.add_timing(slopes, what, "ms", floats=floats, at_most=25.0)
         operations = measurement.work[slopes].operations / measurement.work[rows].operations
-        note = f"by operations {operations:.1f} times"
-        ratio = FigureSpec(what=f"in evaluations, {floats}", at_most=8.0, note=note)
-        measurement.add_ratio(slopes, rows, ratio)
+        what, note = f"in evaluations, {floats}", f"by operations {operations:.1f} times"
+        measurement.add_ratio(slopes, rows, what, at_most=8.0, note=note)
 
 
 def clips(measurement: Measurement, sizes: Sizes) -> None:
@@ -80,12 +71,10 @@ def clips(measurement: Measurement, sizes: Sizes) -> None:
         measurement.samples[_compiling(count)] = [measurement.compile_s[_clips(count)]]
     measurement.time_in_turns(calls)
     for count in counts:
-        measurement.add_timing(_clips(count), FigureSpec(what=_clips(count), unit="ms", scale=1e3))
-        spec = FigureSpec(what=_compiling(count), unit="s")
-        measurement.add_timing(_compiling(count), spec)
+        measurement.add_timing(_clips(count), _clips(count), "ms")
+        measurement.add_timing(_compiling(count), _compiling(count))
     one, several = map(_compiling, counts)
-    what = f"compiling {counts[1]} clips in one's"
-    measurement.add_ratio(several, one, FigureSpec(what=what, at_most=1.5))
+    measurement.add_ratio(several, one, f"compiling {counts[1]} clips in one's", at_most=1.5)
 
 
 def _clips(count: int) -> str:
@@ -120,13 +109,12 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
     solution = solutions[-1]
     measurement.work["ours"] = measurement.work["rows and slopes"] * solution.steps
     note = f"{solution.steps} steps, of which the limit is; cost reached {solution.cost:.1f}"
-    measurement.add_timing("ours", FigureSpec(what="warm", unit="s", at_most=2.0, note=note))
+    measurement.add_timing("ours", "warm", at_most=2.0, note=note)
     measurement.notes.append(f"seconds by stage: {_stages(solution)}; {solution.message}")
     for name, descent in descents.items():
-        measurement.add_ratio(name, "ours", FigureSpec(what=f"{name}: its time in ours"))
+        measurement.add_ratio(name, "ours", f"{name}: its time in ours")
         counts = f"{descent.evaluations} evaluations and {descent.jacobians} Jacobians"
-        note = f"cost {descent.cost:.1f}; {counts}"
-        measurement.add_timing(name, FigureSpec(what=name, unit="s", note=note))
+        measurement.add_timing(name, name, note=f"cost {descent.cost:.1f}; {counts}")
     if not sizes.cold:
         measurement.notes.append("cold fits, and SciPy with differences, are left out")
         return
@@ -135,7 +123,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
         search = statistics.median(measurement.samples[f"its search, {cache} cache"])
         note = f"a process of its own, imports and clip included; the search in it {search:.1f} s"
         name = f"cold, {cache} cache"
-        measurement.add_timing(name, FigureSpec(what=name, unit="s", at_most=target, note=note))
+        measurement.add_timing(name, name, at_most=target, note=note)
 
 
 def _stages(solution: Solution) -> str:
@@ -174,12 +162,9 @@ def posterior(measurement: Measurement, sizes: Sizes) -> None:
     )
     milliseconds, cores = 1e3 * measurement.samples["chain"][0] / evaluations, usable_cores()
     measurement.add_timing(
-        "chain",
-        FigureSpec(
-            what=f"{sizes.walkers} walkers, {sizes.steps} steps", unit="s", threads=cores,
-            at_most=60.0 if evaluations >= FULL_POSTERIOR else None,
-            note=f"{milliseconds:.2f} ms a log-probability; {cores} cores",
-        ),
+        "chain", f"{sizes.walkers} walkers, {sizes.steps} steps", threads=cores,
+        at_most=60.0 if evaluations >= FULL_POSTERIOR else None,
+        note=f"{milliseconds:.2f} ms a log-probability; {cores} cores",
     )  # fmt: skip
 
 
@@ -191,13 +176,10 @@ def sample(measurement: Measurement, sizes: Sizes) -> None:
     """
     searches: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
-        reference, base, ground = workloads.recording(sizes.frames)
-        for name, clip in zip(CLIPS, (reference, base), strict=True):
-            save_clip(Path(folder, name), clip)
-        save_mesh(Path(folder, GROUND), ground.vertices, ground.faces)
+        workloads.save_recording(folder, sizes.frames)
         for number in range(sizes.fits):
             with tempfile.TemporaryDirectory() as cache:
-                environment = {
+                environment = os.environ | {
                     "JAX_ENABLE_X64": "1",
                     "JAX_ENABLE_COMPILATION_CACHE": "1",
                     "JAX_COMPILATION_CACHE_DIR": cache,
@@ -206,31 +188,17 @@ def sample(measurement: Measurement, sizes: Sizes) -> None:
                 for state in ("empty", "persistent"):
                     name = f"cold, {state} cache"
                     measurement.progress(f"fit: {name}, run {number + 1} of {sizes.fits}")
-                    seconds, cpu_seconds = time_calls(
-                        lambda: searches.append(_fit_in_process(folder, environment))  # noqa: B023
+                    fit = functools.partial(
+                        call_in_process, fit_once, folder, environment=environment
                     )
+                    seconds, cpu_seconds = time_calls(lambda: searches.append(fit()))  # noqa: B023
                     measurement.samples.setdefault(name, []).append(seconds)
                     measurement.busy.setdefault(name, []).append(cpu_seconds)
                     search = f"its search, {state} cache"
                     measurement.samples.setdefault(search, []).append(searches[-1])
 
 
-def _fit_in_process(folder: str, environment: Mapping[str, str]) -> float:
-    """Seconds of the search in a new process, which also imports and reads the clip."""
-    finished = subprocess.run(
-        [sys.executable, "-m", "fitting.bench.fits", folder],
-        env=os.environ | environment, check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    return float(finished.stdout)
-
-
-def main() -> None:
-    """Fits once and prints the seconds."""
-    folder = Path(sys.argv[1])
-    reference, base = (load_clip(folder / name) for name in CLIPS)
-    clip_data = workloads.ClipData(reference, base, load_terrain(folder / GROUND))
-    print(f"{find_best_fit(workloads.problem_from_clips([clip_data])).seconds:.2f}")
-
-
-if __name__ == "__main__":
-    main()
+def fit_once(folder: str) -> float:
+    """Reads the clip and fits it, for a process of its own; the seconds of the search."""
+    clip_data = workloads.load_recording(folder)
+    return find_best_fit(workloads.problem_from_clips([clip_data])).seconds

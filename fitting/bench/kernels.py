@@ -18,14 +18,14 @@ import jaxik
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.ground import meshes
 from fitting.problem.problem import Problem
-from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
+from fitting.runtime.threads import cpu_block, usable_cores
 from jaxik.stages.effector import Effector
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.leg import LegGoal, SolvedLeg, TwoBone
 from jaxik.world.terrain import Hit, Terrain, cast, plane
 
 from . import workloads
-from .measurement import Call, Figure, FigureSpec, Measurement, time_in_width
+from .measurement import Call, Figure, Measurement, time_in_width
 from .workloads import Sizes
 
 Vectors = Float[np.ndarray, "legs 3"]
@@ -206,72 +206,61 @@ def leg_and_foot(batch: workloads.LegBatch) -> tuple:
     return foot.pose, leg.hip, leg.knee, foot.ankle
 
 
-class SplitWork(NamedTuple):
-    """Work on many items that the cores of the machine share.
+def _split_over_cores(
+    measurement: Measurement,
+    function: Callable,
+    shared: PyTree,
+    items: PyTree,
+    axis: int = -1,
+    sparse: PyTree = (),
+) -> Call:
+    """A call, named "ours", in which each core computes its part of the work on many items.
 
-    `sparse` are arrays of which a run reads little.
+    Args:
+        measurement: keeps the program's compile time and work.
+        function: of `shared` and of some of the items.
+        shared: by all items.
+        items: arrays.
+        axis: of them, along which the items are counted.
+        sparse: arrays of which a run reads little.
     """
-
-    function: Callable
-    """Of `shared` and of some of the items."""
-    shared: PyTree
-    items: PyTree
-    """Arrays."""
-    axis: int = -1
-    """Along which the items are counted."""
-    sparse: PyTree = ()
-
-
-def _split_over_cores(measurement: Measurement, split: SplitWork) -> Call:
-    """A call, named "ours", in which each core computes its part with the same program."""
-    count = jax.tree.leaves(split.items)[0].shape[split.axis]
+    count = jax.tree.leaves(items)[0].shape[axis]
     size = -(-count // usable_cores())
+    structure = jax.tree.structure((shared, items))
 
     def part_from(first: int) -> list[jax.Array]:
         first = min(first, count - size)  # the last part overlaps, to be of the same size
-        cut = functools.partial(jax.lax.slice_in_dim, axis=split.axis)
-        part = jax.tree.map(lambda leaf: cut(leaf, first, first + size), split.items)
-        return jax.tree.leaves((split.shared, part))
+        cut = functools.partial(jax.lax.slice_in_dim, axis=axis)
+        part = jax.tree.map(lambda leaf: cut(leaf, first, first + size), items)
+        return jax.tree.leaves((shared, part))
 
     def of_part(leaves: list) -> PyTree:
-        structure = jax.tree.structure((split.shared, split.items))
-        return split.function(*jax.tree.unflatten(structure, leaves))
+        return function(*jax.tree.unflatten(structure, leaves))
 
     # Flattened beforehand: while Python flattens arguments, no other thread can start.
-    parts = [part_from(first) for first in range(0, count, size)]
-    program = measurement.compile("ours", of_part, parts[0], sparse=split.sparse)
-    measurement.work["ours"] = measurement.work["ours"] * len(parts)
-    calls = [functools.partial(program, part) for part in parts]
-    return functools.partial(on_all_cores, calls)
+    parts = [(part_from(first),) for first in range(0, count, size)]
+    return measurement.compile_parts("ours", of_part, parts, sparse)
 
 
 def _add_time_per_leg(measurement: Measurement, count: int, at_most: float) -> None:
     """Adds the figure of a kernel; `at_most`, ns, is its target with vectors of 256 bits."""
     work, cores = measurement.work["ours"], usable_cores()
+    note = f"{work.moved / count:.0f} bytes and {work.operations / count:.0f} operations a leg"
     measurement.add_timing(
-        "ours",
-        FigureSpec(
-            what="a leg and core", unit="ns", scale=1e9 * cores / count, threads=cores,
-            at_most=at_most * time_in_width(),
-            note=f"{work.moved / count:.0f} bytes and {work.operations / count:.0f} operations a "
-            "leg",
-        ),
+        "ours", "a leg and core", "ns", items=count / cores, threads=cores,
+        at_most=at_most * time_in_width(), note=note,
     )  # fmt: skip
 
 
 def legs(measurement: Measurement, sizes: Sizes) -> None:
     """Two-bone legs against plain NumPy."""
     batch = workloads.leg_batch(sizes.legs)
-    ours = _split_over_cores(measurement, SplitWork(leg_corrections, batch.ik, batch.lanes))
+    ours = _split_over_cores(measurement, leg_corrections, batch.ik, batch.lanes)
     arguments = numpy_arguments(batch)
     measurement.time_in_turns({"ours": ours, "NumPy": lambda: two_bone(*arguments)})
     _add_time_per_leg(measurement, batch.count, at_most=45.0)
-    measurement.add_ratio(
-        "NumPy", "ours", FigureSpec(what="NumPy's time in ours", note="NumPy on one core")
-    )
-    measurement.add_timing(
-        "NumPy", FigureSpec(what="NumPy, a leg", unit="ns", scale=1e9 / batch.count)
-    )
+    measurement.add_ratio("NumPy", "ours", "NumPy's time in ours", note="NumPy on one core")
+    measurement.add_timing("NumPy", "NumPy, a leg", "ns", items=batch.count)
 
 
 def numpy_arguments(batch: workloads.LegBatch) -> tuple[Legs, KneeLimits]:
@@ -289,8 +278,8 @@ def numpy_arguments(batch: workloads.LegBatch) -> tuple[Legs, KneeLimits]:
 def feet(measurement: Measurement, sizes: Sizes) -> None:
     """Two-bone legs, ankles and all transforms of the solved legs."""
     batch = workloads.leg_batch(sizes.feet)
-    split = SplitWork(leg_and_foot, batch.ik, batch.lanes)
-    measurement.time_in_turns({"ours": _split_over_cores(measurement, split)})
+    ours = _split_over_cores(measurement, leg_and_foot, batch.ik, batch.lanes)
+    measurement.time_in_turns({"ours": ours})
     _add_time_per_leg(measurement, batch.count, at_most=110.0)
 
 
@@ -303,8 +292,9 @@ def rays(measurement: Measurement, sizes: Sizes) -> None:
     note = "with the small programs that its shape needs"
     measurement.add(Figure("build the grid", seconds, "s", note=note))
     origins = workloads.ray_origins(sizes.rays)
-    split = SplitWork(cast_down, ground, jnp.asarray(origins), axis=0, sparse=ground)
-    calls: dict[str, Call] = {"ours": _split_over_cores(measurement, split)}
+    starts = jnp.asarray(origins)
+    ours = _split_over_cores(measurement, cast_down, ground, starts, axis=0, sparse=ground)
+    calls: dict[str, Call] = {"ours": ours}
     tracer = meshes.embree_tracer(mesh.vertices, mesh.faces)
     down = np.tile([0.0, -1.0, 0.0], (len(origins), 1))
     doubles = origins.astype(np.float64)
@@ -315,25 +305,17 @@ def rays(measurement: Measurement, sizes: Sizes) -> None:
         )
     measurement.time_in_turns(calls, sizes.crowd_repeats)
     measurement.add_timing(
-        "ours",
-        FigureSpec(
-            what="rays a second", unit="M", scale=1e-6 * len(origins), rate=True,
-            threads=usable_cores(), note="the limit reads each ray once, and of the ground nothing",
-        ),
+        "ours", "rays a second", "M", items=len(origins), threads=usable_cores(),
+        note="the limit reads each ray once, and of the ground nothing",
     )  # fmt: skip
     if tracer is None:
         measurement.notes.append("no ratio to Embree, which is not installed (pip install embreex)")
         return
     for name in ("Embree, which triangle", "Embree, where"):
-        what, note = f"{name}: its time in ours", "Embree on one core"
-        measurement.add_ratio(name, "ours", FigureSpec(what=what, note=note, at_least=3.0))
-        measurement.add_timing(
-            name,
-            FigureSpec(
-                what=f"{name}: rays a second", unit="M", scale=1e-6 * len(origins), rate=True
-            ),
-        )
-    hits = jax.jit(cast_down)(ground, jnp.asarray(origins))
+        note = "Embree on one core"
+        measurement.add_ratio(name, "ours", f"{name}: its time in ours", note=note, at_least=3.0)
+        measurement.add_timing(name, f"{name}: rays a second", "M", items=len(origins))
+    hits = jax.jit(cast_down)(ground, starts)
     embree_hits = tracer.intersects_location(doubles, down, False)
     measurement.notes.append(_compare_hits(hits, embree_hits[0], embree_hits[1]))
 
@@ -382,13 +364,12 @@ def step(measurement: Measurement, sizes: Sizes) -> None:
             measurement.work[call] = measurement.work[program]
     measurement.time_in_turns(calls)
     for name, target in (("plane", 150.0), ("mesh", None)):
-        packed = FigureSpec(what=f"Character on a {name}", unit="µs", scale=1e6, at_most=target)
-        measurement.add_timing(f"{name}, Character", packed)
-        measurement.add_timing(name, FigureSpec(what=f"step on a {name}", unit="µs", scale=1e6))
+        what = f"Character on a {name}"
+        measurement.add_timing(f"{name}, Character", what, "µs", at_most=target)
+        measurement.add_timing(name, f"step on a {name}", "µs")
     for name in grounds:
         what, note = f"the compiled program, {name}", "called with the leaves of its arguments"
-        spec = FigureSpec(what=what, unit="µs", scale=1e6, note=note)
-        measurement.add_timing(f"{name}, program", spec)
+        measurement.add_timing(f"{name}, program", what, "µs", note=note)
 
 
 def machine(measurement: Measurement, sizes: Sizes) -> None:
@@ -408,21 +389,13 @@ def machine(measurement: Measurement, sizes: Sizes) -> None:
             calls[dtype] = measurement.compile_call(dtype, _product, square)
     measurement.time_in_turns(calls)
     moved, operations = float(floats.nbytes), 2.0 * sizes.side**3
-    measurement.add_timing(
-        "memory",
-        FigureSpec(what="memory, read", unit="GB/s", scale=1e-9 * moved, rate=True, threads=cores),
-    )
+    measurement.add_timing("memory", "memory, read", "GB/s", items=moved, threads=cores)
     for dtype in ("float32", "float64"):
         measurement.add_timing(
-            dtype,
-            FigureSpec(
-                what=f"{dtype}, matrix product", unit="GFLOP/s", scale=1e-9 * operations,
-                rate=True, threads=cores, floats=dtype,
-            ),
+            dtype, f"{dtype}, matrix product", "GFLOP/s",
+            items=operations, threads=cores, floats=dtype,
         )  # fmt: skip
-    measurement.add_timing(
-        "dispatch", FigureSpec(what="a program that does nothing", unit="µs", scale=1e6)
-    )
+    measurement.add_timing("dispatch", "a program that does nothing", "µs")
     # On a CPU by CPU time, so that another process does not lower a ceiling.
     threads = {"memory": cores, "float32": cores, "float64": cores, "dispatch": 1}
     best = {
@@ -461,7 +434,7 @@ def start(measurement: Measurement, sizes: Sizes) -> None:
         "used": "import jax, jaxik; jaxik.run",  # its names are imported when first used
     }
     measurement.time_in_turns({name: run(code) for name, code in codes.items()})
-    measurement.add_timing("jax", FigureSpec(what="import jax", unit="s"))
+    measurement.add_timing("jax", "import jax")
     for what, name, target in (
         ("import jaxik, beyond jax's", "jaxik", 0.3),
         ("and the first use of it", "used", None),

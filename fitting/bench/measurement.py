@@ -6,23 +6,26 @@ in turns, in random order, so that other load on the machine affects all of them
 """
 
 import dataclasses
+import functools
+import json
 import math
 import os
 import platform
 import statistics
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
 from fitting.runtime import activity, cache_folder, xla
-from fitting.runtime.threads import usable_cores
+from fitting.runtime.threads import on_all_cores, usable_cores
 
 from .roofline import Work, lower_bound, work_of_program
 from .workloads import Sizes
@@ -34,30 +37,12 @@ STATUS = Path("/proc/self/status")
 MEMORY = Path("/proc/meminfo")
 CPU = Path("/proc/cpuinfo")
 
+# Factors of a unit. A figure in one of seconds is the time of an item, in another their rate.
+SECONDS = {"s": 1.0, "ms": 1e3, "µs": 1e6, "ns": 1e9}
+RATES = {"M": 1e-6, "GB/s": 1e-9, "GFLOP/s": 1e-9}
+
 # What a machine that is too small, or another process, does to a benchmark; the others go on.
 FAILURES = (MemoryError, jax.errors.JaxRuntimeError, subprocess.CalledProcessError)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FigureSpec:
-    """How a figure follows from the seconds that a call takes, and the value it should reach."""
-
-    what: str
-    unit: str = "times"
-    scale: float = 1.0
-    """Figure = scale * seconds, or scale / seconds for a rate."""
-    rate: bool = False
-    threads: int = 1
-    """That share the work."""
-    floats: str = ""
-    """Float32 or float64, where not that of the whole benchmark."""
-    at_most: float | None = None
-    at_least: float | None = None
-    note: str = ""
-
-    def value(self, seconds: float) -> float:
-        """The figure for a run time, s."""
-        return self.scale / seconds if self.rate else self.scale * seconds
 
 
 @dataclass(frozen=True)
@@ -181,6 +166,22 @@ class Measurement:
         program = self.compile(name, function, *arguments, sparse=sparse)
         return lambda: jax.block_until_ready(program(*arguments))
 
+    def compile_parts(
+        self, name: str, function: Callable, parts: Sequence[tuple], sparse: PyTree = ()
+    ) -> Callable[[], list[PyTree]]:
+        """A call that computes parts of one shape on all cores, by one program.
+
+        Args:
+            name: as for `compile`.
+            function: of one part.
+            parts: the arguments of each.
+            sparse: as for `compile`.
+        """
+        program = self.compile(name, function, *parts[0], sparse=sparse)
+        self.work[name] = self.work[name] * len(parts)
+        calls = [functools.partial(program, *part) for part in parts]
+        return functools.partial(on_all_cores, calls)
+
     def time_in_turns(
         self, calls: Mapping[str, Call], repeats: int = 0, *, warm_up: bool = True
     ) -> dict[str, float]:
@@ -215,38 +216,57 @@ class Measurement:
         """Adds a figure."""
         self.figures.append(figure)
 
-    def add_timing(self, name: str, spec: FigureSpec) -> None:
-        """Adds the median of the samples of this name, with its spread, CPU time and limit."""
-        values = [spec.value(seconds) for seconds in self.samples[name]]
-        busy, limit, bound = None, None, ""
+    def add_timing(
+        self,
+        name: str,
+        what: str,
+        unit: str = "s",
+        *,
+        items: float = 1.0,
+        threads: int = 1,
+        floats: str = "",
+        **rest: Any,
+    ) -> None:
+        """Adds the median of the samples of this name, with its spread, CPU time and limit.
+
+        Args:
+            name: of the samples.
+            what: the figure says.
+            unit: one of `SECONDS` or `RATES`.
+            items: that a call computes.
+            threads: that share the work.
+            floats: float32 or float64, where not those of the whole benchmark.
+            rest: target and note of the figure.
+        """
+
+        def figure(seconds: float) -> float:
+            if unit in SECONDS:
+                return SECONDS[unit] * seconds / items
+            return RATES[unit] * items / seconds
+
+        values = [figure(seconds) for seconds in self.samples[name]]
         if name in self.busy:
             cpu_seconds = max(statistics.median(self.busy[name]), 1e-9)
-            busy = spec.value(cpu_seconds / spec.threads)
+            rest["busy"] = figure(cpu_seconds / threads)
         if name in self.work and self.ceilings:
-            seconds, bound = lower_bound(self.work[name], self.ceilings, spec.floats or self.floats)
-            limit = spec.value(seconds)
-        self._add(spec, statistics.median(values), values, (busy, limit, bound))
+            work = self.work[name]
+            seconds, rest["bound"] = lower_bound(work, self.ceilings, floats or self.floats)
+            rest["limit"] = figure(seconds)
+        spread = min(values), max(values)
+        self.add(Figure(what, statistics.median(values), unit, spread=spread, **rest))
 
-    def add_ratio(self, slow: str, fast: str, spec: FigureSpec) -> None:
-        """Adds how many times as long one call takes as another, as the ratio of the medians."""
+    def add_ratio(self, slow: str, fast: str, what: str, **rest: Any) -> None:
+        """Adds how many times as long one call takes as another, as the ratio of the medians.
+
+        Args:
+            slow: name of the samples of one.
+            fast: of those of the other.
+            what: the figure says.
+            rest: target and note of the figure.
+        """
         ratios = [a / b for a, b in zip(self.samples[slow], self.samples[fast], strict=True)]
         median = statistics.median(self.samples[slow]) / statistics.median(self.samples[fast])
-        self._add(spec, median, ratios)
-
-    def _add(
-        self,
-        spec: FigureSpec,
-        value: float,
-        values: Sequence[float],
-        limits: tuple[float | None, float | None, str] = (None, None, ""),
-    ) -> None:
-        busy, limit, bound = limits
-        self.add(
-            Figure(
-                spec.what, float(value), spec.unit, spec.at_most, spec.at_least,
-                (min(values), max(values)), busy, limit, bound, spec.note,
-            )
-        )  # fmt: skip
+        self.add(Figure(what, median, "times", spread=(min(ratios), max(ratios)), **rest))
 
 
 def medians(samples: Mapping[str, Sequence[float]]) -> dict[str, float]:
@@ -263,6 +283,25 @@ def time_calls(call: Call, count: int = 1) -> tuple[float, float]:
     for _ in range(count):
         call()
     return (time.perf_counter() - start) / count, (_cpu_seconds() - cpu_start) / count
+
+
+def call_in_process(
+    function: Callable[..., Any], *arguments: str | int, environment: Mapping[str, str]
+) -> Any:
+    """What a function of a module returns in a new process, through JSON.
+
+    Raises:
+        subprocess.CalledProcessError: it has failed.
+    """
+    code = (
+        f"import json, sys; from {function.__module__} import {function.__name__} as call; "
+        "print('\\n' + json.dumps(call(*json.loads(sys.argv[1]))))"
+    )
+    finished = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(arguments)],
+        env=environment, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return json.loads(finished.stdout.splitlines()[-1])
 
 
 def _cpu_seconds() -> float:

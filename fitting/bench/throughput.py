@@ -1,23 +1,20 @@
 """Many systems, clips and fits: time and memory against devices, clips and workers.
 
-Each point is a process of its own, so that its peak of memory is its own, too:
-`python -m fitting.bench.throughput WHAT COUNT` prints its numbers as JSON. Devices are those
-of this machine, or simulated ones, which share its cores: they show what sharing costs.
+Each point is a process of its own, so that its peak of memory is its own, too. Devices are those of
+this machine, or simulated ones, which share its cores: they show what sharing costs.
 """
 
 import dataclasses
 import functools
 import itertools
-import json
 import math
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -25,13 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+import fitting
 import jaxik
 from fitting.clips import edit
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.experiment.problems import ClipData
 from fitting.experiment.systems import Preset
+from fitting.runtime import cache_folder, xla
 from fitting.runtime.cluster import Stopwatch, peak_mb
-from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
+from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.viewer import Solver, Subject, Take, knobs
 from fitting.viewer.subject import DEFAULT, cost_of_problem
 from jaxik.world import terrain
@@ -41,23 +40,20 @@ from . import fits, kernels, workloads
 from .measurement import (
     Call,
     Figure,
-    FigureSpec,
     Measurement,
     Series,
+    call_in_process,
     peak_memory_mb,
     reset_peak_memory,
     time_in_width,
 )
-from .roofline import Work
 from .workloads import Crowd, Member, Sizes
 
 FRAMES = 60
 LENGTHS = 33, 50  # frames of the shortest and of the longest of many clips
 SYSTEMS = 4096  # shared out among devices
 FITS = 8  # shared out among workers
-LONGEST = (
-    300.0  # s of a point, compiling included, after which larger ones of its curve are left out
-)
+LONGEST = 300.0  # s of a point, with compiling, after which larger ones are left out
 SIMULATED = "--xla_force_host_platform_device_count={}"
 EXPERIMENT = """
 preset = "record"
@@ -145,12 +141,10 @@ def _measured(what: str, count: int) -> Mapping[str, float]:
     Raises:
         subprocess.CalledProcessError: it has failed.
     """
-    environment = os.environ | ({"XLA_FLAGS": _flags(count)} if what == "devices" else {})
-    finished = subprocess.run(
-        [sys.executable, "-m", "fitting.bench.throughput", what, str(count)],
-        env=environment, check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    return json.loads(finished.stdout.splitlines()[-1])
+    variables = {"JAX_ENABLE_X64": "1"}
+    if what == "devices":
+        variables["XLA_FLAGS"] = _flags(count)
+    return call_in_process(measure_point, what, count, environment=os.environ | variables)
 
 
 def _flags(devices: int) -> str:
@@ -160,10 +154,6 @@ def _flags(devices: int) -> str:
 
 def of_devices(count: int) -> dict[str, float]:
     """Many systems on a clip, on so many devices."""
-    import jax
-
-    import fitting
-
     problem = workloads.problem(FRAMES)
     ik = problem.space.unpack(problem.space.start)
     batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.05, 0.9, SYSTEMS)})
@@ -173,8 +163,6 @@ def of_devices(count: int) -> dict[str, float]:
 
 def of_clips(count: int) -> dict[str, float]:
     """A system on so many clips of different length on one ground."""
-    import fitting
-
     problem = workloads.problem(max(LENGTHS))
     ik = problem.space.unpack(problem.space.start)
     lengths = np.linspace(*LENGTHS, count).astype(int)
@@ -185,23 +173,15 @@ def of_clips(count: int) -> dict[str, float]:
 
 def of_workers(count: int) -> dict[str, float]:
     """Fits of a clip with several seeds, on so many workers of this machine."""
-    import fitting
-    from fitting.clips import save_clip
-    from fitting.ground.meshes import save_mesh
-    from fitting.runtime import cache_folder
-
     cache_folder.use_default()
     with tempfile.TemporaryDirectory() as folder:
-        reference, base, ground = workloads.recording(FRAMES)
-        save_clip(Path(folder, "reference.npz"), reference)
-        save_clip(Path(folder, "base.npz"), base)
-        save_mesh(Path(folder, "ground.ply"), ground.vertices, ground.faces)
+        workloads.save_recording(folder, FRAMES)
         path = Path(folder, "walk.toml")
         path.write_text(EXPERIMENT, encoding="utf-8")
         fitting.fit_many(path, Path(folder, "first"), workers=1, report=False)  # compiles
         began = time.monotonic()
-        fits = fitting.fit_many(path, Path(folder, "fits"), seeds=FITS, workers=count, report=False)
-        efforts = [row["effort"] for row in fits.finished if "effort" in row]
+        made = fitting.fit_many(path, Path(folder, "fits"), seeds=FITS, workers=count, report=False)
+        efforts = [row["effort"] for row in made.finished if "effort" in row]
         return {
             "seconds": time.monotonic() - began,
             "cpu_seconds": sum(effort["cpu_seconds"] for effort in efforts),
@@ -225,24 +205,10 @@ def _second_time(call: Callable[[], object]) -> dict[str, float]:
 POINTS = {"devices": of_devices, "clips": of_clips, "workers": of_workers}
 
 
-def main() -> None:
-    """Measures one point and prints it."""
-    import jax
-
-    import fitting
-
-    fitting.configure_xla()
-    jax.config.update("jax_enable_x64", True)
-    what, count = sys.argv[1:]
-    print(json.dumps(POINTS[what](int(count))))
-
-
-class CrowdScene(NamedTuple):
-    """A crowd on its ground, computed `chunk` characters at a time."""
-
-    crowd: Crowd
-    ground: Terrain
-    chunk: int
+def measure_point(what: str, count: int) -> dict[str, float]:
+    """The numbers of a point, in its process."""
+    xla.configure_xla()
+    return POINTS[what](count)
 
 
 def forward(crowd: Crowd, ground: Terrain, member: Member) -> tuple:
@@ -269,7 +235,12 @@ def reverse(crowd: Crowd, ground: Terrain, member: Member) -> tuple:
 
 
 def in_chunks(
-    measurement: Measurement, name: str, function: Callable, scene: CrowdScene
+    measurement: Measurement,
+    name: str,
+    function: Callable,
+    crowd: Crowd,
+    ground: Terrain,
+    chunk: int,
 ) -> Callable[[], list[PyTree]]:
     """A call that computes a crowd in chunks, as many at a time as there are cores.
 
@@ -279,28 +250,26 @@ def in_chunks(
         measurement: keeps the program's compile time and work.
         name: under which it keeps them.
         function: of a crowd, a ground and one member.
-        scene: the crowd and its ground.
+        crowd: on its ground.
+        ground: of all of it.
+        chunk: characters that are computed at a time.
     """
-    crowd, ground, chunk = scene
     count = crowd.first.size
     chunk = min(chunk, count)
     # The last chunk overlaps the one before, so that all have one shape.
     starts = [min(first, count - chunk) for first in range(0, count, chunk)]
-    members = [
-        jax.tree.map(lambda leaf: leaf[first : first + chunk], crowd.members)  # noqa: B023
-        for first in starts
-    ]
     shared = dataclasses.replace(
         crowd, drawn={}, place_ws=crowd.place_ws[:0], first=crowd.first[:0]
     )
+    parts = [
+        (shared, ground, jax.tree.map(lambda leaf: leaf[first : first + chunk], crowd.members))  # noqa: B023
+        for first in starts
+    ]
 
     def of_chunk(shared: Crowd, ground: Terrain, members: Member) -> PyTree:
         return jaxik.lanes(lambda member: function(shared, ground, member), out_axes=-1)(members)
 
-    program = measurement.compile(name, of_chunk, shared, ground, members[0], sparse=ground)
-    measurement.work[name] = measurement.work[name] * len(members)
-    calls = [functools.partial(program, shared, ground, part) for part in members]
-    return functools.partial(on_all_cores, calls)
+    return measurement.compile_parts(name, of_chunk, parts, ground)
 
 
 def crowd(measurement: Measurement, sizes: Sizes) -> None:
@@ -310,16 +279,15 @@ def crowd(measurement: Measurement, sizes: Sizes) -> None:
     mesh = workloads.ground(workloads.mesh_field(sizes.cells))
     grounds = {"plane": (workloads.single(plane()), 9.0), "mesh": (mesh, 5.0)}
     calls = {
-        name: in_chunks(measurement, name, forward, CrowdScene(people, ground, sizes.chunk))
+        name: in_chunks(measurement, name, forward, people, ground, sizes.chunk)
         for name, (ground, _) in grounds.items()
     }
     reset_peak_memory()
     measurement.time_in_turns(calls, sizes.crowd_repeats)
     peak = peak_memory_mb()
-    work = measurement.work
     for name, (_, target) in grounds.items():
-        what = f"{name}, leg-frames a second"
-        measurement.add_timing(name, _leg_frames(what, count, work[name], target / time_in_width()))
+        what, at_least = f"{name}, leg-frames a second", target / time_in_width()
+        _add_leg_frames(measurement, name, what, count, at_least=at_least)
     note = "all results of the crowd are kept"
     measurement.add(Figure("peak of memory", peak, "MB", note=note))
 
@@ -328,9 +296,9 @@ def gradient(measurement: Measurement, sizes: Sizes) -> None:
     """The gradient for each member's parameters, against the forward run."""
     people = workloads.crowd(sizes.derived, sizes.frames)
     count = sizes.derived * sizes.frames * people.rig.side.size
-    scene = CrowdScene(people, workloads.single(plane()), sizes.chunk)
+    flat = workloads.single(plane())
     calls = {
-        name: in_chunks(measurement, name, function, scene)
+        name: in_chunks(measurement, name, function, people, flat, sizes.chunk)
         for name, function in (("forward", forward), ("reverse", reverse))
     }
     reset_peak_memory()
@@ -338,18 +306,18 @@ def gradient(measurement: Measurement, sizes: Sizes) -> None:
     peak, work = peak_memory_mb(), measurement.work
     operations = work["reverse"].operations / work["forward"].operations
     note = f"{sizes.derived} characters; by operations {operations:.1f} times"
-    ratio = FigureSpec(what="reverse in forward runs", at_most=4.0, note=note)
-    measurement.add_ratio("reverse", "forward", ratio)
-    rate = _leg_frames("leg-frames a second", count, work["reverse"])
-    measurement.add_timing("reverse", rate)
+    measurement.add_ratio("reverse", "forward", "reverse in forward runs", at_most=4.0, note=note)
+    _add_leg_frames(measurement, "reverse", "leg-frames a second", count)
     measurement.add(Figure("peak of memory", peak, "MB"))
 
 
-def _leg_frames(what: str, count: int, work: Work, at_least: float | None = None) -> FigureSpec:
-    """The figure of leg-frames per second, where `count` leg-frames are this work."""
-    return FigureSpec(
-        what=what, unit="M", scale=1e-6 * count, rate=True, threads=usable_cores(),
-        at_least=at_least,
+def _add_leg_frames(
+    measurement: Measurement, name: str, what: str, count: int, at_least: float | None = None
+) -> None:
+    """Adds the figure of leg-frames per second, where a call computes `count` of them."""
+    work = measurement.work[name]
+    measurement.add_timing(
+        name, what, "M", items=count, threads=usable_cores(), at_least=at_least,
         note=f"{work.operations / count:.0f} operations and {work.moved / count:.0f} bytes a "
         f"leg-frame; workspace of a chunk {work.workspace / 1e6:.0f} MB",
     )  # fmt: skip
@@ -467,9 +435,4 @@ def drag(measurement: Measurement, sizes: Sizes) -> None:
     measurement.time_in_turns({"drag": solve})
     seconds = solver.take.base.seconds
     what = f"a drag, {seconds:.0f} s at {RATE:g} Hz"
-    spec = FigureSpec(what=what, unit="ms", scale=1e3, at_most=TARGET)
-    measurement.add_timing("drag", spec)
-
-
-if __name__ == "__main__":
-    main()
+    measurement.add_timing("drag", what, "ms", at_most=TARGET)

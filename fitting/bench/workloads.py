@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 import jaxik
-from fitting.clips import clip_frames
+from fitting.clips import clip_frames, load_clip, save_clip
 from fitting.clips.clip import Clip
 from fitting.experiment.problems import ClipData, make_scene
 from fitting.ground import meshes
@@ -31,6 +32,7 @@ Tree = TypeVar("Tree", bound=PyTree)
 
 FPS, SEED = 60.0, 2
 EXTENT = 64.0  # m, side of the mesh field
+CLIPS, GROUND = ("reference.npz", "base.npz"), "ground.ply"  # files of a recording
 POSITION_NOISE, ROTATION_NOISE = 0.002, 0.0087  # m, rad
 SIGMAS = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": 0.0087, "body": 0.0087}
 # Twenty smooth parameters, with the values that made the clip to be fitted.
@@ -277,6 +279,20 @@ def recording(
         _with_noise(solved.rotations_ws, random),
     )
     return reference, base, mesh
+
+
+def save_recording(folder: str, frame_count: int) -> None:
+    """Writes a recording's `CLIPS` and `GROUND`."""
+    *clips, mesh = recording(frame_count)
+    for name, clip in zip(CLIPS, clips, strict=True):
+        save_clip(Path(folder, name), clip)
+    meshes.save_mesh(Path(folder, GROUND), mesh.vertices, mesh.faces)
+
+
+def load_recording(folder: str) -> ClipData:
+    """What `save_recording` has written."""
+    reference, base = (load_clip(Path(folder, name)) for name in CLIPS)
+    return ClipData(reference, base, meshes.load_terrain(Path(folder, GROUND)))
 
 
 def problem_from_clips(clips: Iterable[ClipData], names: tuple[str, ...] = tuple(TRUTH)) -> Problem:

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import subprocess
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from fitting.bench import fits, kernels, measurement, report, roofline, suite, throughput, workloads
-from fitting.bench.measurement import Benchmark, Figure, FigureSpec, Measurement, Series
+from fitting.bench.measurement import Benchmark, Figure, Measurement, Series
 from fitting.bench.roofline import Work
 from fitting.bench.workloads import Sizes
 from fitting.cli import main
@@ -87,17 +86,15 @@ def test_a_timing_has_its_spread_its_cpu_time_and_its_limit_and_so_has_a_ratio()
     timings = Measurement("x", "x", 3, "float32", ceilings=ceilings)
     timings.samples, timings.busy = {"a": [2.0, 1.0, 4.0]}, {"a": [2.0, 3.0, 6.0]}
     timings.work = {"a": Work(operations=0.5, moved=20.0)}
-    timings.add_timing("a", FigureSpec(what="time", unit="ms", scale=1e3, threads=2))
-    timings.add_timing(
-        "a", FigureSpec(what="rate", unit="M", scale=8.0, rate=True, floats="float64")
-    )
+    timings.add_timing("a", "time", "ms", threads=2)
+    timings.add_timing("a", "rate", "M", items=8e6, floats="float64")
     time, rate = timings.figures
     assert (time.value, time.spread, time.busy) == (2000.0, (1000.0, 4000.0), 1500.0)
     assert (time.limit, time.bound, time.closeness) == (500.0, "arithmetic", 0.25)
     assert (rate.value, rate.spread) == (4.0, (2.0, 8.0))
     assert (rate.limit, rate.closeness) == (8.0, 0.5)
     timings.samples = {"slow": [4.0, 9.0, 6.0], "fast": [2.0, 3.0, 1.0]}
-    timings.add_ratio("slow", "fast", FigureSpec(what="slow in fast", at_least=3.0))
+    timings.add_ratio("slow", "fast", "slow in fast", at_least=3.0)
     ratio = timings.figures[-1]  # of the medians; its spread is that of the turns
     assert (ratio.value, ratio.spread, ratio.met) == (3.0, (2.0, 6.0), True)
     ceilings = {"memory": 100.0, "float32": 2.0, "float64": 1.0, "dispatch": 0.5}
@@ -154,7 +151,7 @@ def trivial_suite(monkeypatch):
 
     def quick(timings: Measurement, sizes: Sizes) -> None:
         timings.time_in_turns({"ours": lambda: None, "theirs": lambda: None})
-        timings.add_timing("ours", FigureSpec(what="ours", unit="s", at_most=1.0))
+        timings.add_timing("ours", "ours", at_most=1.0)
         timings.add(Figure("a ratio", 2.0, "times", at_least=3.0, note="of nothing"))
         timings.series.append(Series("size", [1, 10], {"ours": [1.0, 10.0]}))
 
@@ -356,9 +353,7 @@ def test_a_crowd_in_chunks_is_the_whole_crowd():
         people = workloads.crowd(5, 24)
         flat = workloads.single(kernels.plane())
         timings = Measurement("crowd", "crowd", 1)
-        parts = throughput.in_chunks(
-            timings, "plane", places, throughput.CrowdScene(people, flat, 2)
-        )()
+        parts = throughput.in_chunks(timings, "plane", places, people, flat, 2)()
         parts = [jnp.moveaxis(part, -1, 0) for part in parts]  # members are last
         whole = jax.vmap(lambda member: places(people, flat, member))(people.members)
     first, second, last = parts
@@ -428,17 +423,18 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
 
     def run(command, env, **options):
         processes.append((command[1:], env["JAX_COMPILATION_CACHE_DIR"], env["JAX_ENABLE_X64"]))
-        assert fits.load_clip(Path(command[-1], fits.CLIPS[0])).frame_count == 12
-        return fits.subprocess.CompletedProcess(command, 0, "1.00\n")
+        (folder,) = json.loads(command[-1])
+        assert workloads.load_recording(folder).reference.frame_count == 12
+        return subprocess.CompletedProcess(command, 0, "\n1.00\n")
 
-    monkeypatch.setattr(fits.subprocess, "run", run)
+    monkeypatch.setattr(subprocess, "run", run)
     timings = measure("fit")
     of_fit = figures(timings)
     assert of_fit["warm"].at_most == 2.0
     assert of_fit["cold, empty cache"].at_most == 20.0
     assert of_fit["cold, persistent cache"].at_most == 5.0
     (empty, empty_cache, x64), (full, full_cache, _) = processes
-    assert empty == full and empty[:2] == ["-m", fits.__name__]
+    assert empty == full and fits.__name__ in empty[1]
     assert empty_cache == full_cache and x64 == "1"
     assert sum("cost" in figure.note for figure in timings.figures) == 3
     assert timings.samples["its search, empty cache"] == [1.0]
