@@ -1,14 +1,10 @@
 """The least that a program has to do, and the least time in which a machine could do it.
 
-This is the roofline model with dispatch added. Operations are those of `operations`. Bytes are
-those of the arguments, read once, and of the results, written once. Both are lower bounds: a
-program that is close to neither spends its time on something else.
-
-Operations of a program, counted before XLA fuses it.
-
-XLA's own analysis counts the body of a loop once, so this one reads JAX's program. JAX does not
-promise to keep the names that are read here: those of its primitives, the `length` of a scan, the
-`dimension_numbers` of a product of matrices. Nothing else in this project depends on them.
+This is the roofline model with dispatch added. Bytes are those of the arguments, read once, and of
+the results, written once. Operations are counted in JAX's program, before XLA fuses it, as XLA's
+own analysis counts the body of a loop once. Both are lower bounds: a program that is close to
+neither spends its time on something else. JAX does not promise to keep the names that are read
+here, and nothing else in this project depends on them.
 """
 
 import dataclasses

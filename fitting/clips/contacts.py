@@ -3,15 +3,11 @@
 A foot stands while its ball is slow, provided that it was put down: a ball that rises into a slow
 spell and falls out of it hangs at the top of a swing or a jump. Heights are not compared with a
 floor, since the ground may be at any height. Balls that noise shakes are smoothed for speeds, and
-stand for as long as they stay within the noise of their place.
+stand for as long as they stay within the noise of their place. Noise is seen in fourth differences,
+of which a low quantile shows noise alone: a standing foot moves too smoothly to have any.
 
 Limits are for an adult. A body twice as large moves twice as fast if it plays the same animation,
 and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
-
-Noise of captured points, and how much smoothing takes it out of their speeds.
-
-Noise is seen in fourth differences: a body moves too smoothly to have any at the rates of captures,
-least of all while a foot stands, so that a low quantile of them shows noise alone.
 """
 
 from collections.abc import Sequence

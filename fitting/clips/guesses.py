@@ -1,13 +1,11 @@
-"""The unit of length of a file that does not state it, and doubts about one that is stated.
+"""What a file does not state: its unit of length, doubts about a stated one, and balls of feet.
 
-Both go by the length of the legs, from hip to ankle, which is half of the body's height. Legs of
-adults are 0.6 to 1.1 m, those of children 0.4 m at three years.
+The unit follows from the length of the legs, from hip to ankle, which is half of the body's height.
+Legs of adults are 0.6 to 1.1 m, those of children 0.4 m at three years.
 
-Balls of feet that end at the ankle, as in files that leave out joints without motion.
-
-The ball is put where that of a person's foot is. The two proportions are about the means of ten
-feet of five captured people: in these the ball is 0.13 to 0.16 of the leg's length from the ankle,
-and 0.16 to 0.44 of that distance below it while the foot lies flat.
+Where feet end at the ankle, the ball is put where that of a person's foot is. The two proportions
+are about the means of ten feet of five captured people: in these the ball is 0.13 to 0.16 of the
+leg's length from the ankle, and 0.16 to 0.44 of that distance below it while the foot lies flat.
 """
 
 from dataclasses import replace

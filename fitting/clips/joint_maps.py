@@ -1,14 +1,8 @@
 """Joint roles: which joint of a skeleton is the pelvis, and which are hip, knee, ankle and toe.
 
-Roles are recognised by joint name, in one of the naming conventions of `clips.joint_maps`, or named
-by the caller.
-
-Naming conventions of joints: a table, and what recognises them in a skeleton.
-
-A convention is recognised with any prefix that its joints have in common: `mixamorig:`, `Bip01 `,
-`DEF-`, `CC_Base_`, or the name of a character.
-
-Joint maps: TOML files in which a user says which joint of a skeleton is which.
+They are recognised by the joints' names in a naming convention, with any prefix that the joints
+have in common (`mixamorig:`, `Bip01 `, `DEF-`, `CC_Base_`, the name of a character), or named in a
+joint map, a TOML file:
 
 pelvis = "Hüfte"
 hip_left = "Oberschenkel.L"     # legs may have any names; those that end in l or left are left legs

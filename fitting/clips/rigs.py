@@ -1,6 +1,4 @@
-"""Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints.
-
-Geometry of two-bone legs over the frames of a clip: hinges, knees and bone rotations.
+"""Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its two-bone legs.
 
 All arrays are float64 in world space with frames leading, (frames, 3) unless said otherwise.
 """

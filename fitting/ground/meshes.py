@@ -1,20 +1,16 @@
 """Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes.
 
-Heightfields as files, which `load_terrain` reads beside meshes.
-
-`.npz`, as `numpy.savez` writes it; it states its own spacing:
+Heightfields (`jaxik.world.terrain.heightfield` says more) come as `.npz`, which states its spacing:
 
     heights         (rows, columns), m; rows along z, columns along x; NaN leaves holes
     spacing         m, between neighbours; two numbers are those along x and along z
     origin          (3), m, of row 0 and column 0 at height 0; where missing, zero
     interpolation   "bilinear" or "triangulated"; where missing, "bilinear"
 
-`.npy`, as `numpy.save` writes it: the heights alone. `.png`: a grey picture of 8 or 16 bits, whose
-levels are heights; x goes right and z goes down in it. It may be stored in colours of 8 bits, as
-long as all of them are grey and opaque. For both the user says how far neighbours
-are apart, the cell, and for a picture also how many metres a level is.
-
-`jaxik.world.terrain.heightfield` says more about each array.
+as `.npy`, the heights alone, or as `.png`: a grey picture of 8 or 16 bits, whose levels are
+heights; x goes right and z goes down in it. It may be stored in colours of 8 bits, as long as all
+of them are grey and opaque. For both the user says how far neighbours are apart, the cell, and for
+a picture also how many metres a level is.
 """
 
 import io

@@ -1,10 +1,8 @@
 """Reconstructs the ground below a captured clip from where its feet stood.
 
 Three kinds of surface are fitted to the footprints: a plane, a smooth thin plate and level blocks
-on a grid. Each predicts the height of every footprint from the others, and the simplest kind that
-no other predicts clearly better is chosen.
-
-Finds the square grid of level blocks that best explains where feet stood, and how high.
+on a square grid. Each predicts the height of every footprint from the others, and the simplest kind
+that no other predicts clearly better is chosen.
 
 Pitch, heading and offset of the grid are unknown, and so is the height of every block. A grid is
 scored by its evidence: the probability of all measured heights with the unknown block heights

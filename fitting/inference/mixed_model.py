@@ -1,19 +1,13 @@
-"""The fit of a hierarchy: centres, spreads and each clip's parameters, from all clips together.
+"""The linear mixed model of several clips, and the fit of its centres, spreads and parameters.
 
-It alternates, as Lindstrom and Bates (1990) do for nonlinear mixed models, between the linear mixed
+The fit alternates, as Lindstrom and Bates (1990) do for nonlinear mixed models, between the linear
 model that the clips' residuals give around their present parameters, which has the most probable
 spreads, and a step of Gauss and Newton towards its mode, halved until the cost falls. Thresholds
-are held: they have no derivatives.
+are held: they have no derivatives. Likelihoods are approximated as Laplace's approximation of a
+single fit does, by Gauss and Newton with the Fisher information where the loss has one, which takes
+no program that a search has not compiled already.
 
-Quadratic approximations: of a clip's likelihood around a point, and of the prior.
-
-Of the likelihood it is that of Gauss and Newton, with the Fisher information where the loss has
-one, as for Laplace's approximation of a single fit. It takes no program that a search has not
-compiled already.
-
-The linear mixed model: quadratic likelihoods of several clips, tied by a population.
-
-Minus the log-likelihood of clip c is `½ u'A_c u - a_c'u`. A parameter of it is
+Minus the log-likelihood of clip c is then `½ u'A_c u - a_c'u`. A parameter of it is
 
     u = centre                        where all clips share it
     u = centre + spread z_g           where it varies: z_g is standard normal, one for each group

@@ -1,16 +1,13 @@
 """The noise that a problem assumes, as plain numbers, and the likeliest one at a point.
 
-Sigmas that a posterior leaves open: integrated out while sampling, and drawn afterwards.
-
-With normal residuals the integral over a sigma is known, so that the sampler needs no dimension
-for it; given the parameters, its square is a scaled inverse chi-square (Gelman et al., Bayesian
-Data Analysis, 3rd edition, 3.2), from which it is drawn exactly.
-
-The likeliest sigma and correlation of errors, and the likeliest tails.
-
 Errors of a kind are a first-order autoregression of stationary standard deviation sigma, so that
 the innovations `(e_t - rho e_{t-1}) / sqrt(1 - rho²)` are independent with the same sigma. Their
 density is that of the loss: normal, Student's t, or the one whose logarithm a robust loss is.
+
+Sigmas that a posterior leaves open are integrated out while sampling. With normal residuals the
+integral is known, so that the sampler needs no dimension for it; given the parameters, the square
+is a scaled inverse chi-square (Gelman et al., Bayesian Data Analysis, 3rd edition, 3.2), from which
+it is drawn exactly.
 """
 
 import dataclasses

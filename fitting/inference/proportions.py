@@ -1,12 +1,10 @@
 """How often something holds in many replicates, with bounds of the probability behind it.
 
-Ranks of truths among draws of their posteriors, and the band in which their ECDF should lie.
-
-Simulation-based calibration (Talts et al. 2018, arXiv 1804.06788): with truths drawn from the prior
-and data simulated from them, the rank of a truth among independent draws of its posterior is
-uniform. The band is that of Säilynoja, Bürkner and Vehtari (2022, Statistics and Computing 32:32):
-the pointwise binomial intervals of the empirical distribution function (ECDF), widened until whole
-curves lie inside with the level that is asked for. It is found by simulation.
+Simulation-based calibration (Talts et al. 2018, arXiv 1804.06788) ranks truths among independent
+draws of their posteriors: with truths drawn from the prior and data simulated from them, ranks are
+uniform. The band of their empirical distribution function (ECDF) is that of Säilynoja, Bürkner and
+Vehtari (2022, Statistics and Computing 32:32): the pointwise binomial intervals, widened until
+whole curves lie inside with the level that is asked for. It is found by simulation.
 """
 
 import dataclasses

@@ -1,6 +1,4 @@
-"""Which parameters change a motion at all: a sweep over every range, before anything is fitted.
-
-Which parameters to free for clips of which nothing is known yet.
+"""Which parameters change a motion at all, and which to free before anything is known.
 
 Each parameter is swept over its range while the others stay at the system's values, and again at a
 few draws from a wide prior, for at one point a rule may happen to be idle. The mean slope of every
@@ -9,11 +7,9 @@ its derivative, and a normal approximation then tells how far the clips would na
 parameters together. The one they narrow down least is fixed, and so on, until they narrow down all.
 It is a forecast: what the clips do determine is for the fit to say.
 
-The few parameters on which it depends whether a system leaves a motion alone.
-
 On flat ground a capture says nothing but that foot IK must not move the feet. Where a system moves
-them, each parameter is swept over its range while the others stay, the change that helps most is
-kept, and so on, up to `MOST` changes. They are for a fit to refine.
+them, the change of one parameter that helps most is kept, and so on, up to `MOST` changes, which
+are for a fit to refine.
 """
 
 import dataclasses

@@ -4,16 +4,12 @@ Foot IK takes such an animation and the terrain, and should return the captured 
 it, the terrain is taken out from under the feet: during a stance a foot is lowered by the height of
 the ground below it and turned about its ball by the ground's slope, which foot IK adds again;
 between two stances by a quintic smoothstep from one height to the next, and from one slope to a
-foot as captured in mid-swing.
+foot as captured in mid-swing. A foot whose foothold the start of a clip cuts off swings at the
+height of its next one: down stairs, through those that it comes from.
+
 The pelvis keeps its path in the ground plane at a constant height: what it does on uneven ground is
 for foot IK to find. Where the ground is flat, there is nothing to find, and the clip itself is such
-an animation: the pelvis moves as captured. Knees follow from the law of
-cosines, in the plane in which the captured leg bends.
-
-Swings that the start of a clip cuts off, on ground that is higher where they began.
-
-Such a foot has left a foothold that the clip does not show. Without it, the foot swings at the
-height of its next foothold: down stairs, through those that it comes from.
+an animation. Knees follow from the law of cosines, in the plane in which the captured leg bends.
 """
 
 from collections.abc import Callable

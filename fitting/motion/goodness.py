@@ -1,21 +1,16 @@
-"""How far motions are from the captured one, in m and rad, and what follows for a fit.
+"""How far motions are from the captured one, in m and rad, and whether a fit fits.
 
 Three motions are compared on the same frames: the flat animation without foot IK, the system as it
 was before the fit, and the fitted one. Distances are root mean squares over frames and legs. Frames
 that were held out say what the parameters are worth on motion that they were not fitted to.
 
-Size and autocorrelation of a series of residuals, each with its significance.
-
-Residuals come in standard deviations, frames first and a column for each leg and component. Columns
-are taken as independent of one another and are pooled. The expected mean is zero and is not
-subtracted: a constant offset is a misfit, and shows as correlation.
-
-Whether a fit fits, in one sentence that rests on size and significance.
-
-With ten thousand residuals everything is significant, so a finding must be large as well. The
-sizes are those from which intervals are wrong by a quarter. `tests/analysis/test_goodness.py` holds
-them against simulated noise: no false alarm in 95 % of fits whose noise is as assumed, and every
-violation found.
+The verdict rests on size and autocorrelation of the residuals, each with its significance.
+Residuals come in standard deviations, frames first and a column for each leg and component, which
+count as independent and are pooled. The expected mean is zero and is not subtracted: a constant
+offset is a misfit, and shows as correlation. With ten thousand residuals everything is significant,
+so a finding must be large as well. The sizes are those from which intervals are wrong by a quarter.
+`tests/analysis/test_goodness.py` holds them against simulated noise: no false alarm in 95 % of fits
+whose noise is as assumed, and every violation found.
 """
 
 import math

@@ -1,15 +1,12 @@
 """A system together with what is not known of the captures that it is fitted to.
 
-Ground that is higher than its file says, or tilted.
+Ground may be higher than its file says, or tilted. A ray along -up keeps its place seen from above,
+so it meets raised ground where a ray that starts as much lower meets the ground as it is: no mesh
+is built anew, nor moved for each parameter.
 
-A ray along -up keeps its place seen from above, so it meets raised ground where a ray that starts
-as much lower meets the ground as it is. So no mesh is built anew, nor moved for each parameter.
-
-What a capture would show of a motion, were it as its numbers say.
-
-A residual is what the capture would show minus what it shows. The other way round, captured motion
-that is corrected, and so interpolated and scaled, would have less noise for some numbers than for
-others, and the fit would choose those.
+A residual is what the capture would show of the motion minus what it shows. The other way round,
+captured motion that is corrected, and so interpolated and scaled, would have less noise for some
+numbers than for others, and the fit would choose those.
 """
 
 import dataclasses

@@ -1,9 +1,8 @@
-"""A space of systems together with the data they are fitted to.
+"""A space of systems together with the data they are fitted to, and the losses.
 
-Losses. All but the squares limit how far a few bad frames can pull a fit.
-
-A loss replaces the square `z` of a residual in sigmas by `rho(z)`, which is minus twice the
-logarithm of a density, up to a constant:
+All losses but the squares limit how far a few bad frames can pull a fit. A loss replaces the square
+`z` of a residual in sigmas by `rho(z)`, which is minus twice the logarithm of a density, up to a
+constant:
 
     squares    z                               normal
     huber      z up to HUBER², and 2 HUBER sqrt(z) - HUBER² beyond

@@ -1,9 +1,8 @@
 """The data of one clip: the animation a system runs on, and the motion it should reproduce.
 
-What is not known of a capture: where its ground is, when it begins, where its joints are.
-
-None of it belongs to a system. Left out of a fit, it pulls the system's parameters to wherever they
-make up for it; fitted with a narrow prior, it takes its share, and intervals say what is left.
+What is not known of a capture (where its ground is, when it begins, where its joints are) belongs
+to no system. Left out of a fit, it pulls the system's parameters to wherever they make up for it;
+fitted with a narrow prior, it takes its share, and intervals say what is left.
 """
 
 # pyright: reportInvalidTypeVarUse=false

@@ -1,17 +1,15 @@
-"""Clips that share one world: run one after another, they need one program and not one each.
+"""Clips that share one world: run one after another or side by side, they need one program.
 
 Compiling takes most of the time of a fit, and with each clip its own, it would grow with their
 number. So the terrains of all clips are put side by side into one mesh, far enough apart that no
 ray of a clip meets the ground of another, and all frames go through one loop, in which memory
 starts anew at the first frame of each clip. Foot IK is the same wherever a world has its origin.
-
 Terrains that are no static meshes can be shared only by clips that have the same one.
 
-Clips of different length as one array, so that one program computes all of them.
-
-A clip is made longer by repeating its last frame, which then was not observed: nothing that a frame
-shows depends on later ones, and what was not observed has no residuals. Lengths are rounded up to a
-few, so that a thousand clips of a thousand lengths need a few programs.
+Side by side, clips of different length are one array. A clip is made longer by repeating its last
+frame, which then was not observed: nothing that a frame shows depends on later ones, and what was
+not observed has no residuals. Lengths are rounded up to a few, so that a thousand clips of a
+thousand lengths need a few programs.
 """
 
 import dataclasses

@@ -1,37 +1,28 @@
 """The free parameters of a system as one unbounded vector `u`, for solvers and samplers.
 
-Per parameter
+Per parameter, whose range, kind and scale its declaration says,
 
     value = g⁻¹( g(floor) + (g(high) - g(floor)) sigmoid(u) )
 
 with `g` the identity, the logarithm, or for a gain `log(-log(1 - gain))`, which is minus the
 logarithm of its half-life up to a constant, so that the tick rate cancels. `floor` is the lower
 bound, or, for a parameter declared above another one, the larger of that bound and the other one's
-value: the order holds for every `u`.
+value: the order holds for every `u`. `start` is where a search begins.
 
-`start` is where a search begins, and `prior` what is known of `u` before any data; both are at the
-values of the system as it is, unless told otherwise. A value in the outer sixth of its range often
-means that something is off, and not how it is when it is on: such a prior is centred a sixth
-inside. A uniform prior of a parameter declared above another one is uniform between that one's
-value and the upper bound, whatever that value is.
-
-Which numbers of a system a fit may change: range, kind and scale of each.
-
-Arrays are JAX's, or NumPy's where `library` says so.
-
-What is known of the free parameters before any data: the prior of `u`.
-
-Each parameter has a prior of its own, independent of the others. In `u`, the coordinate without
-bounds of `space`, it has one of two shapes:
+`prior` is what is known before any data, of each parameter independently, in one of two shapes:
 
     normal     log density = -½ ((u - centre) / spread)²          up to a constant
     uniform    log density = -2 log cosh(u / 2)                   up to a constant
 
-The second is the logistic distribution, whose image under the sigmoid is uniform: the value is
-anywhere in its range with equal density, on the parameter's scale (linear, logarithmic or by way of
-the half-life). The solver needs residuals, half of whose squares' sum is minus the log density; the
-sampler takes the same function, and since both see densities of `u`, no Jacobian of the transform
-enters.
+Both it and `start` are at the values of the system as it is, unless told otherwise. A value in the
+outer sixth of its range often means that something is off, and not how it is when it is on: such a
+prior is centred a sixth inside. The uniform prior is the logistic distribution, whose image under
+the sigmoid is uniform: the value is anywhere in its range with equal density, on the parameter's
+scale; of a parameter declared above another one, between that one's value and the upper bound. The
+solver needs residuals, half of whose squares' sum is minus the log density; the sampler takes the
+same function, and since both see densities of `u`, no Jacobian of the transform enters.
+
+Arrays are JAX's, or NumPy's where `library` says so.
 """
 
 import dataclasses

@@ -1,12 +1,9 @@
 """The folder in which programs are kept between processes: where it is, and what lies in it.
 
-It is JAX's folder for compiled programs. The traced ones lie in a folder inside it.
-
-JAX's files of compiled programs, each of which is to be complete or missing.
-
-JAX (0.10.2 to 0.12.0.1) writes such a file in place, and never again once it is there. A process
-that reads it at that moment warns and compiles for itself; one that is killed at that moment
-leaves half a file, of which every later process warns, and which none replaces.
+It is JAX's folder for compiled programs, with one inside it for the traced ones. JAX (0.10.2 to
+0.12.0.1) writes a compiled program in place, and never again once it is there. A process that reads
+it at that moment warns and compiles for itself; one that is killed at that moment leaves half a
+file, of which every later process warns, and which none replaces. Here each is complete or missing.
 """
 
 import functools

@@ -1,8 +1,6 @@
-"""The job that writes parameters for others: as files of ours, the game's record, or settings.
+"""Writes parameters for others, and copies of the experiments that come with the package.
 
-The experiments that come with the package, and copies of them with all of their files.
-
-They lie in the folder `data` of the repository. A wheel has them in `fitting/examples`.
+Those lie in the folder `data` of the repository. A wheel has them in `fitting/examples`.
 """
 
 import os

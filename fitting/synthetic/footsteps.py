@@ -1,19 +1,14 @@
-"""Footsteps of the synthetic walk: where each foot stands, and how it moves from one to the next.
+"""Footsteps: where each foot stands, and how it moves from one foothold to the next.
 
-A standing foot is placed: it rolls over its heel, lies flat, and rises about a ball that does not
-move. Between two stances the ball follows the measured curves of `gait`. The gap between those
-curves and the placed feet is blended in.
+In the walk a standing foot rolls over its heel, lies flat, and rises about a ball that does not
+move. Between two stances the ball follows measured curves, and the gap between those
+and the placed feet is blended in. The curves are one stride of an average adult, the mean of six
+(CMU motion capture database, subject 02, trials 01 and 02, floor tilt removed), as Fourier series
+over its phase 0..1. Phase 0 is the touchdown of the ball of the foot; the other foot is half a
+stride later.
 
-The walk cycle of an average adult: measured curves over one stride, and body dimensions.
-
-The curves are the mean of six strides (CMU motion capture database, subject 02, trials 01 and 02,
-floor tilt removed), as Fourier series over the phase 0..1 of a stride. Phase 0 is the touchdown of
-the ball of the foot; the other foot is half a stride later.
-
-Feet that stand where they are told to, and swing from each foothold to the next.
-
-A standing foot lies flat, and rises about a ball that does not move before it leaves the ground. It
-swings as people move their hands: along the path of minimum jerk, with an arc above it.
+Feet that are told where to stand lie flat, rise about the ball, and swing as people move their
+hands: along the path of minimum jerk, with an arc above it.
 """
 
 from collections.abc import Callable, Sequence

@@ -2,12 +2,9 @@
 
 A rigid trunk travels along a path at constant speed. Each limb stands on its foothold while the
 trunk passes over it, for the same fraction of every stride, and swings to the next one. Knees and
-elbows follow from the law of cosines, so bones keep their lengths exactly. Motion is made over a
-floor with y up and z ahead; for the climber the floor is then set upright.
-
-A synthetic body: a pelvis on two legs whose bones keep their lengths, over given feet.
-
-The pelvis gives way where a leg would not reach its foot, and knees follow from the law of cosines.
+elbows follow from the law of cosines, so bones keep their lengths exactly; the pelvis gives way
+where a leg would not reach its foot. Motion is made over a floor with y up and z ahead; for the
+climber the floor is then set upright.
 """
 
 from dataclasses import dataclass, replace

@@ -1,20 +1,16 @@
-"""Reader of Biovision BVH files.
+"""Biovision BVH files.
 
-It is lenient where files in circulation differ: any line ending, tabs or blanks, any spacing in
-`End Site` and `Frames:`, any channel and rotation order per joint, and position channels that
+Reading is lenient where files in circulation differ: any line ending, tabs or blanks, any spacing
+in `End Site` and `Frames:`, any channel and rotation order per joint, and position channels that
 replace the offset of any joint. Angles are in degrees. End sites become joints named
-`<parent>_end`.
+`<parent>_end`. Existing libraries failed on the reference files: pybvh refuses joints with six
+channels, upc-pymotion reads those wrongly without an error and fails on roots that list rotations
+first, and bvhio 1.5.4 is correct but works in float32 and takes 9 s for 994 frames.
 
-Existing libraries failed on the reference files: pybvh refuses joints with six channels,
-upc-pymotion reads those wrongly without an error and fails on roots that list rotations first, and
-bvhio 1.5.4 is correct but works in float32 and takes 9 s for 994 frames.
-
-Writes clips as Biovision BVH files.
-
-A clip that came from a BVH file goes back into its hierarchy: the same joints, offsets, channels,
+A clip that came from a BVH file is written into its hierarchy: the same joints, offsets, channels,
 axes, unit and frame time. Any other clip gets a standard one: centimetres, y up, and angles in the
-order ZXY. Either way a joint gets further channels where its own cannot hold the motion, as when a
-knee that could only bend has to turn sideways. So joint positions are always exact.
+order ZXY. A joint whose channels cannot hold the motion, such as a knee that could only bend, gets
+further ones, so that joint positions are always exact.
 """
 
 import re

@@ -1,20 +1,17 @@
-"""Joint centres from the markers of Vicon's Plug-in Gait, lower body.
+"""Joints with their rotations, from markers that a joint map or Plug-in Gait names.
 
-Hips lie where the regression of Harrington et al. (2007, J. Biomech. 40:595, their equations with
-one predictor each) puts them between the pelvis' markers. Plug-in Gait itself uses that of Davis et
-al. (1991, Hum. Mov. Sci. 10:575), which needs the length of the leg and is further off: 25 mm
-against 12 mm, of 67 pelves in a CT scanner (Mantovani et al. 2016, Gait & Posture 44:48). Both take
-the centres of the markers for the bone below them.
+Positions are joint centres, as in Vicon's Plug-in Gait (lower body) but for the hips: those lie
+where the regression of Harrington et al. (2007, J. Biomech. 40:595, their equations with one
+predictor each) puts them between the pelvis' markers. Plug-in Gait itself uses that of Davis et al.
+(1991, Hum. Mov. Sci. 10:575), which needs the length of the leg and is further off: 25 mm against
+12 mm, of 67 pelves in a CT scanner (Mantovani et al. 2016, Gait & Posture 44:48). Both take the
+centres of the markers for the bone below them. Knees and ankles lie where Davis' chord function
+puts them: in the plane of the joint above, the marker on the joint and the marker on the wand or
+segment, half a joint's width and the radius of a marker inwards, with a right angle at the joint.
 
-Knees and ankles lie where Davis' chord function puts them: in the plane of the joint above, the
-marker on the joint and the marker on the wand or segment, half a joint's width and the radius of a
-marker inwards, with a right angle at the joint.
-
-Joints with their rotations, from markers that a joint map or Plug-in Gait names.
-
-Positions are joint centres. Rotations are what positions and further markers show: the pelvis'
-from three of its markers, or else from hips and thighs; thigh and shin as in `leg_geometry`; the
-foot's from ankle, heel and toe, or else from the foot and the hinge of the knee.
+Rotations are what positions and further markers show: the pelvis' from three of its markers, or
+else from hips and thighs; thigh and shin as in `clips.rigs`; the foot's from ankle, heel and toe,
+or else from the foot and the hinge of the knee.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,10 +1,7 @@
 """The markers of a C3D file: their names, places and gaps, and what the file says of them.
 
-The bytes of a C3D file: its header, parameters and points, as the C3D User Guide has them.
-
-Whatever header and parameters claim has to lie within the file, which also bounds the memory that
-reading takes. Analog values are skipped: how many lie beside the points of a frame is all that has
-to be known of them.
+Header, parameters and points are read as the C3D User Guide has them. Whatever they claim has to
+lie within the file, which also bounds the memory that reading takes. Analog values are skipped.
 """
 
 import itertools

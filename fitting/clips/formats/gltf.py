@@ -2,12 +2,8 @@
 
 All nodes above the skeleton, with their rotations, scales and motion, are part of it: positions
 are those of the scene, in metres with y up, as the format has it. Meshes, materials and morph
-targets are not read.
-
-The contents of a glTF file: its header, and the arrays that the header describes.
-
-Nothing that the header claims is believed: every count and place is held against the bytes that
-are there, so that reading takes no more memory than the file has.
+targets are not read. Every count and place in the header is held against the bytes that are there,
+so that reading takes no more memory than the file has.
 """
 
 import base64

@@ -1,9 +1,7 @@
 """Writes clips as GLB: a skeleton with one animation, and if wanted the terrain beside it.
 
-A mesh that looks like the bones of a skeleton, since some programs take no skeleton without one.
-
-Unreal Engine, among others, makes a skeleton only of a mesh that hangs on it. Each bone is an
-octahedron from a joint to its child, as wide as in Blender, and moves with the joint.
+Some programs, Unreal Engine among them, make a skeleton only of a mesh that hangs on it: each bone
+is an octahedron from a joint to its child, as wide as in Blender, and moves with the joint.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Evolution: a population that crosses the cliffs and the valleys where descents end.
+"""Evolution and sweeps, which cross the cliffs and leave the valleys where descents end.
 
 A hard decision makes the cost jump wherever it flips, whether a threshold or a smooth parameter
 flipped it. Candidates therefore vary all parameters, each in one or more of four ways:
@@ -12,15 +12,12 @@ jitter     one or two smooth parameters, up to 30 times as far as the data leave
 The most promising come again after a Gauss-Newton step, since other decisions need other smooth
 parameters. After some generations the best one descends; rounds of both go on while they gain.
 
-The costs of many candidates at once.
+Costs of candidates are computed with 32-bit floats, side by side in the lanes of vector registers:
+a quarter of the time that 64 bits take under `jax.vmap`. They differ by about a millionth of
+themselves, which ranks candidates; where one is adopted, a descent computes its cost anew.
 
-Costs are computed with 32-bit floats, side by side in the lanes of vector registers: a quarter of
-the time that 64 bits take under `jax.vmap`. They differ by about a millionth of themselves, which
-ranks candidates well enough; where one is adopted, a descent computes its cost anew.
-
-Sweeps: each parameter carried over its whole range, to leave the valleys of single parameters.
-
-A clamp that is never reached has no derivative to follow, and neither has a threshold.
+A sweep carries each parameter over its whole range: a clamp that is never reached has no derivative
+to follow, and neither has a threshold.
 """
 
 import dataclasses

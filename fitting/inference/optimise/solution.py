@@ -1,6 +1,4 @@
-"""What a search reports while it runs, and its result.
-
-What the stages of a search hand on to each other.
+"""What the stages of a search hand on to each other, its reports while it runs, and its result.
 
 Every stage is a function `(search, state, ...) -> state`. A `Search` is what stays the same, a
 `SearchState` what changes. Stages change neither: called again with the same state they do the

@@ -7,8 +7,6 @@ solution, some with a random move besides, since where a cliff is depends on all
 best candidate is the base of the next ones. Far from the solution, where its Jacobian does not
 hold, a descent by Levenberg–Marquardt follows.
 
-Slopes of thresholds whose effect is gradual.
-
 A threshold has no derivative, but where it shifts a weight that fades in or out, the motion changes
 in proportion all the same, and two such thresholds may form a ridge along which both must move. Its
 slope is that of a secant, over a step that changes the residuals by about as much as noise does.

@@ -1,13 +1,12 @@
 """The profile of one parameter, and what it says: valleys, interval and verdict.
 
-How far a profile rises within an interval.
-
-Near its lowest point a profile is a parabola, and half a quantile of chi-square is right (1.92 for
-95 %). The profile of a limit that a clip hardly reaches is not: beside a plateau, where the limit
-does nothing, a narrow valley lies where it happens to suit the noise of some frames. That valley is
-the deepest of many that noise might have made, so chi-square excludes the plateau too often. The
-profile is therefore also read as a density of the parameter's probability, prior included, and an
-interval reaches as high as the smallest region with enough of it.
+Near its lowest point a profile is a parabola, and half a quantile of chi-square is right for how
+far it rises within an interval (1.92 for 95 %). The profile of a limit that a clip hardly reaches
+is not: beside a plateau, where the limit does nothing, a narrow valley lies where it happens to
+suit the noise of some frames. That valley is the deepest of many that noise might have made, so
+chi-square excludes the plateau too often. The profile is therefore also read as a density of the
+parameter's probability, prior included, and an interval reaches as high as the smallest region with
+enough of it.
 """
 
 import dataclasses

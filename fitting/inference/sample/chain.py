@@ -6,12 +6,9 @@ Here a finished step is one record appended to a journal beside the HDF5 file, i
 a checksum. A kill can only tear the last record, which is then dropped.
 
 From time to time `save` writes the whole chain to a new HDF5 file (`write_chain`), replaces the old
-one atomically and empties the journal. Steps that are in both are recognised by their number.
-
-The HDF5 file of a chain: what is written, and what is accepted when it is read again.
-
-It has the layout of emcee's backend (3.1.6), which can read it, and in its attributes the format
-and the identity of the run.
+one atomically and empties the journal. Steps that are in both are recognised by their number. The
+file has the layout of emcee's backend, which can read it, and in its attributes the format and the
+identity of the run.
 """
 
 import dataclasses
