@@ -16,8 +16,8 @@ from .studies.animation_jobs import apply as apply
 from .studies.animation_jobs import compare as compare
 from .studies.animation_jobs import run_suite as run_suite
 from .studies.animation_jobs import solve as solve
-from .studies.calibrate.calibration_jobs import calibrate as calibrate
-from .studies.calibrate.calibration_jobs import calibrate_wrong_model as calibrate_wrong_model
+from .studies.calibrate.calibration import calibrate as calibrate
+from .studies.calibrate.wrong_model import calibrate_wrong_model as calibrate_wrong_model
 from .studies.draft_report import init as init
 from .studies.exports import export as export
 from .studies.fit.fit_jobs import fit as fit

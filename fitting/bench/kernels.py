@@ -214,15 +214,9 @@ def _split_over_cores(
     axis: int = -1,
     sparse: PyTree = (),
 ) -> Call:
-    """A call, named "ours", in which each core computes its part of the work on many items.
+    """A call, named "ours", in which each core computes its part of the items with one program.
 
-    Args:
-        measurement: keeps the program's compile time and work.
-        function: of `shared` and of some of the items.
-        shared: by all items.
-        items: arrays.
-        axis: of them, along which the items are counted.
-        sparse: arrays of which a run reads little.
+    Items are arrays, counted along `axis`; a run reads little of those that are `sparse`.
     """
     count = jax.tree.leaves(items)[0].shape[axis]
     size = -(-count // usable_cores())

@@ -101,9 +101,7 @@ class Series:
     def slope(self, name: str, last: int = 0) -> float:
         """Exponent of the power law of a curve: 1 where twice the size takes twice the time.
 
-        Args:
-            name: of the curve.
-            last: how many of the last points to use; 0 for all. NaN for a single point.
+        Of the `last` points, 0 for all; NaN for a single point.
         """
         sizes, seconds = np.log(self.sizes[-last:]), np.log(self.seconds[name][-last:])
         return float(np.polyfit(sizes, seconds, 1)[0]) if len(sizes) > 1 else float("nan")
@@ -143,13 +141,9 @@ class Measurement:
     def compile(
         self, name: str, function: Callable, *arguments: PyTree, sparse: PyTree = ()
     ) -> Callable:
-        """The function compiled for these arguments; keeps its compile time and its work.
+        """The function compiled for these arguments; keeps its compile time and its work by name.
 
-        Args:
-            name: under which they are kept.
-            function: of arrays.
-            arguments: what it is compiled for.
-            sparse: arrays among them of which a run reads little; see `work_of_program`.
+        A run reads little of the arrays that are `sparse`; see `work_of_program`.
         """
         self.progress(f"{self.name}: compiling {name}")
         start = time.perf_counter()
@@ -169,14 +163,7 @@ class Measurement:
     def compile_parts(
         self, name: str, function: Callable, parts: Sequence[tuple], sparse: PyTree = ()
     ) -> Callable[[], list[PyTree]]:
-        """A call that computes parts of one shape on all cores, by one program.
-
-        Args:
-            name: as for `compile`.
-            function: of one part.
-            parts: the arguments of each.
-            sparse: as for `compile`.
-        """
+        """A call that computes parts of one shape on all cores, by one program."""
         program = self.compile(name, function, *parts[0], sparse=sparse)
         self.work[name] = self.work[name] * len(parts)
         calls = [functools.partial(program, *part) for part in parts]
@@ -187,11 +174,8 @@ class Measurement:
     ) -> dict[str, float]:
         """Median seconds of each call; they run in turns, in random order.
 
-        Args:
-            calls: by name.
-            repeats: samples of each call; 0 for the number of the measurement.
-            warm_up: whether to call each twice beforehand, which also finds how many calls make a
-                sample. Without it, a sample is one call.
+        Without `repeats`, as often as the measurement says. The warm-up calls each twice, which
+        also finds how many calls make a sample; without it, a sample is one call.
         """
         counts = dict.fromkeys(calls, 1)
         for name, call in calls.items() if warm_up else ():
@@ -258,11 +242,7 @@ class Measurement:
     def add_ratio(self, slow: str, fast: str, what: str, **rest: Any) -> None:
         """Adds how many times as long one call takes as another, as the ratio of the medians.
 
-        Args:
-            slow: name of the samples of one.
-            fast: of those of the other.
-            what: the figure says.
-            rest: target and note of the figure.
+        `rest` has target and note of the figure.
         """
         ratios = [a / b for a, b in zip(self.samples[slow], self.samples[fast], strict=True)]
         median = statistics.median(self.samples[slow]) / statistics.median(self.samples[fast])
@@ -420,11 +400,7 @@ def run_benchmarks(
 ) -> Report:
     """Measures benchmarks one after another; an interrupt ends it and keeps what was measured.
 
-    Args:
-        benchmarks: by name.
-        sizes: of the workloads.
-        quick: whether these are the small sizes, for the report.
-        announce: called with a line at the start and at the end of each benchmark.
+    `announce` gets a line at the start and at the end of each.
     """
     report, ceilings = Report(quick), {}
     cached = cache_folder.setting(cache_folder.ENABLED)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from jaxtyping import PyTree
 from matplotlib.figure import Figure as PlotFigure
 
 from fitting.report import formatting, style
-from fitting.report.style import STAGES, styled
+from fitting.report.style import STAGES, panels, styled
 from fitting.runtime import files, xla
 
 from .measurement import (
@@ -190,18 +189,10 @@ def write(report: Report, numbers: Path | None, curves: Path | None) -> list[Pat
 
 @styled
 def draw_curves(series: Sequence[Series], title: str) -> PlotFigure:
-    """Seconds against each size on logarithmic axes, every curve with its slope.
-
-    Args:
-        series: with at least one point each.
-        title: of the figure.
-    """
-    rows = math.ceil(len(series) / COLUMNS)
+    """Seconds against each size on logarithmic axes, every curve with its slope."""
     columns = min(COLUMNS, len(series))
-    figure = PlotFigure(figsize=(6.2 * columns, 4.6 * rows + 0.8), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, one_size in zip(grid, series, strict=False):
+    figure, grid = panels(len(series), columns, title, 4.6, 0.8, width=6.2 * columns)
+    for axes, one_size in zip(grid, series, strict=True):
         sizes = one_size.sizes
         for colour, (name, seconds) in zip(STAGES, one_size.seconds.items(), strict=False):
             label = f"{name}, slope {one_size.slope(name):.2f}" if len(sizes) > 1 else name
@@ -211,6 +202,4 @@ def draw_curves(series: Sequence[Series], title: str) -> PlotFigure:
             axes.set_xticks(sizes, [str(size) for size in sizes])
             axes.set_xticks([], minor=True)
         axes.legend()
-    for axes in grid[len(series) :]:
-        axes.set_axis_off()
     return figure

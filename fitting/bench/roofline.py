@@ -44,12 +44,9 @@ class Work:
 
 
 def work_of_program(traced: Traced, compiled: Compiled, sparse: PyTree = ()) -> Work:
-    """The work of a program.
+    """The work of a program, traced by `jax.jit(function).trace(*arguments)` and compiled.
 
-    Args:
-        traced: `jax.jit(function).trace(*arguments)`.
-        compiled: the same program, compiled.
-        sparse: arrays among the arguments of which a run reads little; their bytes do not count.
+    Bytes of `sparse` arguments do not count: a run reads little of them.
     """
     program = traced.jaxpr.jaxpr
     operations, needed = count_operations(program)
@@ -70,16 +67,11 @@ def _bytes(aval: Any) -> float:
 
 
 def lower_bound(work: Work, ceilings: Mapping[str, float], floats: str) -> tuple[float, str]:
-    """Least seconds in which the work can be done, and what bounds it.
+    """Least seconds in which the work can be done, and which of the ceilings bounds it.
 
-    Args:
-        work: of one run.
-        ceilings: of the machine: "memory" in bytes per second, "float32" and "float64" in
-            operations per second, "dispatch" in seconds of a program that does nothing.
-        floats: which of the two float types the work uses.
-
-    Returns:
-        The seconds, and "memory", "arithmetic" or "dispatch".
+    Ceilings are those of the machine: "memory" in bytes per second, "float32" and "float64" in
+    operations per second, "dispatch" in seconds of a program that does nothing. The bound of the
+    floats is called "arithmetic".
     """
     seconds = {
         "memory": work.moved / ceilings["memory"],
@@ -93,15 +85,11 @@ def lower_bound(work: Work, ceilings: Mapping[str, float], floats: str) -> tuple
 def count_operations(
     program: Jaxpr, wanted: Iterable[bool] = itertools.repeat(True)
 ) -> tuple[float, list[bool]]:
-    """Operations on floats, and which arguments they need.
+    """Operations on floats, and which arguments the wanted results need.
 
     Code on which no result depends does not count, but a loop is taken as a whole. A loop of known
     length counts in full, one whose length depends on its data as one iteration; of branches, the
     longest counts.
-
-    Args:
-        program: to count in.
-        wanted: which of its results are.
     """
     needed = _variables(program.outvars, wanted)
     total = 0.0

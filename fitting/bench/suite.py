@@ -42,10 +42,7 @@ def choose(
 ) -> dict[str, Benchmark]:
     """The benchmarks of these names, and always that of the ceilings, in the order of the table.
 
-    Args:
-        benchmarks: to choose from.
-        only: names with commas between them; None for all.
-        quick: whether None leaves the long ones out.
+    Without names (`only`, with commas between them) all; of a quick run without the long ones.
 
     Raises:
         ValueError: for an unknown name, or no name.

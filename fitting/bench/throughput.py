@@ -242,17 +242,10 @@ def in_chunks(
     ground: Terrain,
     chunk: int,
 ) -> Callable[[], list[PyTree]]:
-    """A call that computes a crowd in chunks, as many at a time as there are cores.
+    """A call that computes a crowd on its ground in chunks, as many at a time as there are cores.
 
-    All chunks use one program: its workspace, times the cores, is what a crowd of any size needs.
-
-    Args:
-        measurement: keeps the program's compile time and work.
-        name: under which it keeps them.
-        function: of a crowd, a ground and one member.
-        crowd: on its ground.
-        ground: of all of it.
-        chunk: characters that are computed at a time.
+    All chunks use one program, of a crowd, a ground and one member: its workspace, times the cores,
+    is what a crowd of any size needs.
     """
     count = crowd.first.size
     chunk = min(chunk, count)

@@ -67,14 +67,9 @@ def examine(*, quick: bool) -> Iterator[Finding]:
 
 
 def print_findings(findings: Iterator[Finding], width: int) -> int:
-    """Prints each finding at once, and at the end all problems with their remedies.
+    """Prints each finding at once, and at the end all problems, of which it returns the number.
 
-    Args:
-        findings: of an examination.
-        width: characters in a line.
-
-    Returns:
-        The number of problems.
+    Lines have at most `width` characters.
     """
     problems = []
     for finding in findings:

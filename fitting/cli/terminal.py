@@ -95,9 +95,8 @@ def make_console(stream: Stream | None) -> "Console | None":
 def show(text: str) -> None:
     """Prints a result on stdout at once: the next one may take an hour.
 
-    Args:
-        text: as it is printed in a pipe. On a terminal its tables are drawn, if it knows them as
-            `report.formatting` does.
+    In a pipe it is printed as it is; on a terminal its tables are drawn, as `report.formatting`
+    made them.
     """
     console = console_in_use.get() if can_draw(sys.stdout) else None
     if (console := console or make_console(sys.stdout)) is None:

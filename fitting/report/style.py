@@ -19,6 +19,7 @@ STANDING, LOCKED, SLIDING = "#56B4E9", "#009E73", "#CC79A7"
 PRIOR = "#009E73"
 STAGES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 GROUND, EARTH = "#5f5236", "#ece5d6"
+WIDTH = 17.0  # inches, of most figures
 SPAN = 5.0  # s, length of the section that is also shown enlarged
 LONG = 8.0  # s; shorter clips are not enlarged
 STYLE: Any = {
@@ -41,6 +42,28 @@ STYLE: Any = {
     "figure.constrained_layout.h_pad": 0.1,
 }
 styled = matplotlib.rc_context(STYLE)
+
+
+def panels(
+    count: int, columns: int, title: str, height: float, margin: float, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a title and panels, row by row.
+
+    Args:
+        count: of the panels.
+        columns: of them in a row.
+        title: of the figure.
+        height: of a row, inches.
+        margin: inches for title and legend.
+        options: of `Figure.subplots`; and `width`, inches.
+    """
+    rows, width = -(-count // columns), options.pop("width", WIDTH)
+    figure = Figure(figsize=(width, height * rows + margin), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(rows, columns, squeeze=False, **options).ravel().tolist()
+    for unused in axes[count:]:
+        unused.set_axis_off()
+    return figure, axes[:count]
 
 
 def steepest_part(time: np.ndarray, pelvis: np.ndarray) -> tuple[int, int]:

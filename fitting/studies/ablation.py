@@ -56,7 +56,7 @@ from fitting.report.formatting import (
     number,
     transposed,
 )
-from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
+from fitting.report.style import AFTER, CAPTURED, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
@@ -65,6 +65,7 @@ from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
 from .animations import Animation
+from .campaign import Campaign
 from .fit.assess import search_with_noise
 from .fit.sentences import listed
 from .output import output_folder, publish
@@ -127,25 +128,31 @@ class Split:
     """Clips, and the frames of them that count."""
 
 
+class Task(NamedTuple):
+    """A variant that is fitted and measured on a split."""
+
+    key: str
+    """As that of its row."""
+    name: str
+    """Of the variant."""
+    variant: Experiment
+    part: int
+    """As that of its row."""
+    split: Split
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.split.name}"
+
+
 def fit_variants(
-    experiment: Experiment,
-    folder: Path | None = None,
-    *,
-    folds: int = 2,
+    experiment: Experiment, folder: Path | None = None, *, folds: int = 2
 ) -> list[Row]:
     """Fits and measures all variants, the complete one first, each on all splits of the clips.
 
-    An interrupt (Ctrl-C) loses the fit that is running and no other.
-
-    Args:
-        experiment: an experiment with ablations.
-        folder: where finished fits are kept. Those that it has of this experiment, its files and
-            these folds are not repeated; those of others are dropped. None keeps them in memory.
-        folds: number of parts into which each clip is cut.
+    Rows in the folder are not repeated; those of other experiments, files and folds are dropped.
 
     Raises:
-        ValueError: there are fewer than two folds, or a foot never stands in one of the parts; a
-            variant does not fit the clips; the folder's `contribution.json` is something else.
+        ValueError: as `ablate`.
     """
     if folds < 2:
         raise ValueError(f"folds is {folds}; wanted 2 or more parts, of which one is held out")
@@ -154,33 +161,30 @@ def fit_variants(
     for name, variant in variants.items():
         with error_context(name):
             _check(variant)
-    finished = {row.key: row for row in read(folder)}
+    stored = {row.key: row for row in read(folder)}
     with activity.announced("Reading the clips"):
         data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
     splits = list(split(experiment.clips, data, folds))
     content = "" if folder is None else _digest(experiment.clips)
-    rows: list[Row] = []
-    count = len(variants) * len(splits)
-    with activity.announced(f"Fitting {len(variants)} variants", count) as fitting:
-        for name, variant in variants.items():
-            any_new = False
-            for part, one_split in enumerate(splits, 1):
-                key = _key(variant, one_split.name, content)
-                row = finished.pop(key, None)
-                if row is None:
-                    any_new = True
-                    label = f"{name}, {one_split.name}"
-                    with error_context(label), activity.announced(f"Fitting {label}"):
-                        row = _fit(variant, one_split)
-                    row = replace(row, key=key, variant=name, part=part % len(splits))
-                    _write(folder, [*rows, row, *finished.values()])
-                    activity.report(row)
-                    activity.log(row_text(row))
-                # The variant may have another name by now.
-                rows.append(replace(row, variant=name, part=part % len(splits)))
-                fitting.advance()
-            if any_new:
-                jax.clear_caches()  # no other variant can use these programs
+    tasks = [
+        Task(_key(variant, part.name, content), name, variant, number % len(splits), part)
+        for name, variant in variants.items()
+        for number, part in enumerate(splits, 1)
+    ]
+
+    def read_row(task: Task) -> Row | None:
+        row = stored.pop(task.key, None)
+        # The variant may have another name by now.
+        return row and replace(row, variant=task.name, part=task.part)
+
+    def write_row(task: Task, row: Row) -> None:
+        _write(folder, [*campaign.finished(), row, *stored.values()])
+        if sum(tasks[index].name == task.name for index in campaign.missing) == 1:
+            jax.clear_caches()  # no other variant can use its programs
+
+    title = f"Fitting {len(variants)} variants"
+    campaign = Campaign(title, tasks, _fit, read_row, write_row, row_text)
+    rows = campaign.run()
     _write(folder, rows)
     return rows
 
@@ -258,21 +262,23 @@ def _hide(data: ClipData, frames: slice) -> ClipData:
     return data._replace(reference=replace(reference, mask=mask))
 
 
-def _fit(variant: Experiment, data: Split) -> Row:
-    """The row of a variant on a split, without its key and its name."""
+def _fit(task: Task) -> Row:
+    """The row of a task."""
+    _, _, variant, _, data = task
     values, converged, message, seconds = {}, True, "Nothing is free.", 0.0
-    ik = variant.starting_system(data.measured[0][0].base.rig)
+    first = data.measured[0][0].base.rig
+    ik = variant.starting_system(first)
     if variant.free:
-        fitted = replace(variant, clips=tuple(entry for entry, _ in data.fitted))
-        resampled = (_at_rate(clip, variant.fps) for _, clip in data.fitted)
-        problem = problem_from_clips(fitted, resampled)
-        problem, solution = search_with_noise(problem, variant)
+        with activity.announced(f"Fitting {task}"):
+            fitted = replace(variant, clips=tuple(entry for entry, _ in data.fitted))
+            resampled = (_at_rate(clip, variant.fps) for _, clip in data.fitted)
+            problem = problem_from_clips(fitted, resampled)
+            problem, solution = search_with_noise(problem, variant)
         if solution.interrupted:
             raise KeyboardInterrupt
         ik = problem.space.unpack(solution.u)
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
-    first = data.measured[0][0].base.rig
     with activity.announced("Measuring how far it is from the capture"):
         accuracy = summarise(
             [
@@ -280,7 +286,7 @@ def _fit(variant: Experiment, data: Split) -> Row:
                 for clip, frames in data.measured
             ]
         )
-    return Row("", "", 0, accuracy, values, converged, message, seconds)
+    return Row(task.key, task.name, task.part, accuracy, values, converged, message, seconds)
 
 
 def _for_body(ik: jaxik.FootIK, size: float | None) -> jaxik.FootIK:
@@ -589,15 +595,10 @@ def variant_name(variant: str) -> str:
 def overview(rows: Sequence[Row], title: str) -> Figure:
     """Each figure of all variants: on parts held out, and where everything was fitted."""
     variants = list(dict.fromkeys(row.variant for row in rows))
-    lines = -(-len(ACCURACY) // PANELS_PER_ROW)
-    size = (17, lines * (0.45 * len(variants) + 1.2) + 1.8)
-    figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(lines, PANELS_PER_ROW, squeeze=False, sharey=True)
-    for axes, key in zip(grid.flat, ACCURACY, strict=False):
+    height = 0.45 * len(variants) + 1.2
+    figure, grid = panels(len(ACCURACY), PANELS_PER_ROW, title, height, 1.8, sharey=True)
+    for axes, key in zip(grid, ACCURACY, strict=True):
         _bars(axes, key, rows, variants)
-    for axes in list(grid.flat)[len(ACCURACY) :]:
-        axes.set_axis_off()
     legend(
         figure,
         Patch(color=AFTER, label=f"{COMPLETE}: mean of the parts held out"),
@@ -641,10 +642,7 @@ def _bars(axes: Axes, key: str, rows: Sequence[Row], variants: Sequence[str]) ->
 
 @in_float64
 def ablate(
-    experiment: Experiment | str | Path,
-    output: str | Path | None = None,
-    *,
-    folds: int = 2,
+    experiment: Experiment | str | Path, output: str | Path | None = None, *, folds: int = 2
 ) -> list[Row]:
     """Fits an experiment as it is and without each of its rules, cross-validated.
 
@@ -657,8 +655,9 @@ def ablate(
         folds: number of parts into which each clip is cut.
 
     Raises:
-        ValueError: as `fit_variants`, the experiment fits a capture, too, or the folder
-            cannot be made.
+        ValueError: there are fewer than two folds, or a foot never stands in one of the parts; a
+            variant does not fit the clips; the experiment fits a capture, too; the folder cannot
+            be made, or its `contribution.json` is something else.
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)

@@ -20,8 +20,13 @@ from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
-from fitting.studies.calibrate import calibration
-from fitting.studies.calibrate.replicates import DRAWS, LEVELS
+from fitting.studies.calibrate import calibration, wrong_model
+from fitting.studies.calibrate.replicates import (
+    DRAWS,
+    LEVELS,
+    LOG_PROBABILITY,
+    make_replicates,
+)
 from fitting.studies.population import population
 from support.curves import curve_problem
 from support.watching import listening
@@ -37,16 +42,19 @@ PARAMETER = {
 ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
 OUTCOME = {"number": 0, "cost": 10.5, "starts": 2, "agreeing": 2, "parameters": [PARAMETER]}
 FIT = {"truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "truth_valley_cost": 10.0}
-CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, calibration.LOG_PROBABILITY: 3}}
+CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, LOG_PROBABILITY: 3}}
 CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
 DISTANCES = {motion: dict.fromkeys(CLOSE, 0.02) for motion in MOTIONS}
 JUDGEMENT = {"fits": True, "sentence": "Fits.", "distances": dict.fromkeys(PARTS, DISTANCES)}
 WRONG_MODEL = {"truth_values": {"lean.gain": 0.2}, "errors": {"drift": 0.01}}
 WRONG_MODEL |= dict.fromkeys(("captured", "lasting", "noise_free"), JUDGEMENT)
 REPLICATES = {
-    calibration.FITS: OUTCOME | FIT | ENDING,
-    calibration.CHAINS: CHAIN | ENDING,
-    calibration.WRONG_MODEL: OUTCOME | WRONG_MODEL | ENDING,
+    "fits": OUTCOME | FIT | ENDING,
+    "chains": CHAIN | ENDING,
+    "wrong_model": OUTCOME | WRONG_MODEL | ENDING,
+}
+KINDS = {
+    kind.folder: kind for kind in (calibration.FITS, calibration.CHAINS, wrong_model.WRONG_MODEL)
 }
 
 
@@ -118,7 +126,6 @@ def load_rows(path: Path) -> None:
 
 def load_replicate(path: Path) -> None:
     """As `jaxik calibrate` reads it."""
-    kind = path.parent.name
-    stage = calibration._Stage(path.parents[1], 1, None, ["lean.gain"], kind)
-    (result,) = stage.run(_refuse, [None])
+    kind, folder = KINDS[path.parent.name], path.parents[1]
+    (result,) = make_replicates(kind, folder, ["lean.gain"], _refuse, [0])
     assert result["number"] == 0 and isinstance(result["seconds"], float)

@@ -17,7 +17,7 @@ from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment, parse_experiment
 from fitting.ground.meshes import load_terrain
 from fitting.report import style
-from fitting.studies.population.population import clip_names
+from fitting.studies.campaign import clip_names
 from support import experiments
 from support.sample_clips import BVH
 

@@ -26,13 +26,13 @@ ROUNDING = "a few more or less roundings are as good"
 LOOK = "changes how a picture looks, which the eye judges"
 NO_SIGN = "any negative number lets NumPy work out the length"
 REASONS = {
-    "fitting/studies/calibrate/calibration_report.py": [("Line2D([], [], color=", "", LOOK)],
+    "fitting/studies/calibrate/calibration.py": [("Line2D([], [], color=", "", LOOK)],
     "fitting/studies/fit/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
     "fitting/studies/population/population_report.py": [("columns=5", "columns= 4", LOOK)],
     "fitting/bench/kernels.py": [
         ("(flat_ankle, axis=-1)", "(flat_ankle, axis=1)", "there are two axes")
     ],
-    "fitting/bench/report.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
+    "fitting/bench/report.py": [("width=6.2", "width= 7.2", LOOK)],
     "fitting/cli/drawing.py": [
         ("default=0", "default= 1", "the longest word counts only where it is long")
     ],

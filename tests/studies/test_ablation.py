@@ -204,7 +204,7 @@ def test_only_changed_variants_are_fitted_again(tmp_path, search, monkeypatch):
 
     first = ablate()
     assert new == first and len(search.calls) == 6
-    assert clearings == [3, 6, 9], "after each variant its programs are dropped"
+    assert clearings == [2, 5, 8], "with the last row of each variant its programs are dropped"
     renamed = ablate(WITHOUT.replace('pitch"', 'tilt"'))
     assert len(search.calls) == 6 and len(new) == 9 and len(clearings) == 3
     assert renamed[3].variant == "tilt"

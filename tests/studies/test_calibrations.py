@@ -24,9 +24,13 @@ from fitting.inference.noise import noise_of
 from fitting.inference.profiles.profile import make_profile
 from fitting.problem.problem import Problem
 from fitting.report import document, pages
-from fitting.studies.calibrate import calibration, calibration_report, replicates
-from fitting.studies.calibrate.assessment import Assessment, assess, summarise
-from fitting.studies.calibrate.calibration import Calibration
+from fitting.studies.calibrate import calibration, replicates
+from fitting.studies.calibrate.calibration import (
+    Assessment,
+    Calibration,
+    assess,
+    summarise,
+)
 from support import small_studies
 from support.experiments import ROOT
 from support.pages import Page
@@ -58,7 +62,7 @@ def calibrate(path: Path, folder: Path | None, count: int, **options) -> Calibra
     experiment = load_experiment(path)
     with jax.enable_x64(True):
         problem = problems.make_problem(experiment)
-        return calibration.calibrate(experiment, problem, folder, count, **options)
+        return calibration.make_fits_and_chains(experiment, problem, folder, count, **options)
 
 
 class Made(NamedTuple):
@@ -126,7 +130,7 @@ def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made, experime
     assessment = assess(changed)
     assert (assessment.wrong, assessment.wrong_but_converged) == ((2, 3), (2,))
     assert assessment.unconverged == (3,) and assessment.valley.hits == 2
-    text = document.text(calibration_report.document(experiment, changed, assessment))
+    text = document.text(calibration.document(experiment, changed, assessment))
     assert "Replicates in another valley: 2, 3 (2 in all)." in text
     assert "In another valley, but said to have converged: 2 (1 in all)." in text
     assert "a valley 3.5 above the truth's" in replicates.fit_line(fits[1])
@@ -158,7 +162,7 @@ def test_recovery_counts_determined_parameters_within_5_percent_of_their_range(m
     assessment = assess(Calibration(fits, []))
     assert (assessment.recovery.hits, assessment.recovery.total) == (1, 2)
     assert assessment.recovery_of["foot.max_pitch"].total == 0
-    assert "0 of 0" in str(calibration_report.parameter_table(assessment))
+    assert "0 of 0" in str(calibration.parameter_table(assessment))
 
 
 def test_ranks_are_uniform_however_many_draws_a_chain_has():
@@ -317,7 +321,7 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
 def test_the_picture_marks_ranks_that_leave_their_band(finished):
     ranks = finished.assessment.ranks
     wrong = dataclasses.replace(ranks["pelvis.on_gain"], ranks=np.zeros(40, int))
-    figure = calibration_report.ranks({**ranks, "foot.max_pitch": wrong}, "title")
+    figure = calibration.ranks({**ranks, "foot.max_pitch": wrong}, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:6] == [
         "pelvis.on_gain", "", "foot.max_pitch", "outside its band", "log-probability", ""

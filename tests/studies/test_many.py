@@ -25,9 +25,9 @@ from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
 from fitting.runtime import cluster
 from fitting.runtime.claimed_folder import claimed
+from fitting.studies.campaign import Campaign
 from fitting.studies.fit import run_folder
 from fitting.studies.many import evaluation, many_tasks
-from fitting.studies.many import fit_many as many_fits
 from fitting.studies.many import fit_many as task_of_worker
 from fitting.studies.many.many_tasks import plan
 from jaxik.maths import parameter_tree
@@ -106,12 +106,12 @@ def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_fi
     for kept in list(out.glob(f"runs/**/{many_tasks.ROW}"))[1:]:
         kept.unlink()
 
-    def interrupted(client, make, tasks):
-        make(tasks[0])  # its row is written, and nobody hears of it
+    def interrupted(self, client):
+        self.make(self.tasks[self.missing[0]])  # its row is written, and nobody hears of it
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(many_fits, "_computed", interrupted)
+    monkeypatch.setattr(Campaign, "_calls", interrupted)
     lines: list[str] = []
     with listening(lines.append):
         fits = fit_many(experiment_file, out, seeds=2)

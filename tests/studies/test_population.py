@@ -17,8 +17,9 @@ from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import NoiseOptions
 from fitting.report import document, pages
+from fitting.studies.campaign import clip_names
 from fitting.studies.population import population, population_report
-from fitting.studies.population.population import Population, clip_names
+from fitting.studies.population.population import Population
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
@@ -126,11 +127,11 @@ def test_only_other_settings_are_searched_anew(made, tmp_path, monkeypatch, undr
     out, searched = tmp_path / "out", []
     shutil.copytree(made.folder / "searches", out / "searches")
 
-    def watched(searches, name, *_):
-        searched.append(name)
+    def watched(task):
+        searched.append(task.name)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(population.Searches, "_search", watched)
+    monkeypatch.setattr(population, "_search", watched)
     with pytest.raises(KeyboardInterrupt):
         fitting.population(write_population(tmp_path, top="seed = 1"), out)
     assert searched == ["uneven_walk from 0 s"]

@@ -21,7 +21,7 @@ from fitting.inference import sensitivity
 from fitting.motion.goodness import CLOSE
 from fitting.problem.space import present_value
 from fitting.report import document, pages
-from fitting.studies.calibrate import wrong_model, wrong_model_report
+from fitting.studies.calibrate import wrong_model
 from fitting.studies.calibrate.wrong_model import (
     LARGEST,
     SPREAD,
@@ -250,7 +250,7 @@ def test_false_verdicts_are_outside_and_shown(tmp_path):
     assert assessment.outside == ["the share of true verdicts"] and assessment.false == (1, 2, 3)
     assert (assessment.verdicts_of["fits"].hits, assessment.verdicts_of["fits"].total) == (1, 4)
     experiment = load_experiment(write(tmp_path))
-    text = document.text(wrong_model_report.document(experiment, "mec", fits, assessment))
+    text = document.text(wrong_model.document(experiment, "mec", fits, assessment))
     assert "outside their bounds: the share of true verdicts" in text
     assert 'Replicate 1 says: "Said." Without errors: ankles 1.0 cm, knees 1.5 cm' in text
     assert "ankles 2.5 cm, knees 3.8 cm" in text

@@ -1,82 +1,89 @@
-"""Many replicates of an experiment, each kept on disk as soon as it is finished.
+"""Calibration: fits of simulated motion whose truth is known, and whether what they say is true.
 
-identity.json           what is calibrated; another experiment is refused
-fits/0000.json          the fit of a replicate
-chains/0000.json        its posterior, where chains were wanted
-wrong_model/0000.json   the fit of a replicate whose motion another system makes
-
-A call continues where an earlier one ended, also with more replicates, or with chains for fits that
-have none yet. All replicates of a process share their compiled programs.
+Each claim of fits and posteriors is checked against bounds that hold for all of them at once: a
+program whose claims are true passes every check with a probability of 95 %.
 """
 
 import dataclasses
 import functools
-import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from scipy import special
 
 import jaxik
 from fitting.experiment.experiment import Experiment
-from fitting.problem.problem import Problem, digest
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.in_memory import with_files
+from fitting.experiment.problems import make_problem
+from fitting.inference.proportions import Proportion, RankTest, proportion
+from fitting.problem.problem import Problem
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import Table, percent
+from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, panels, styled
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
-from fitting.runtime.store import Store
-from fitting.runtime.validation import Content, error_context
-from fitting.studies.translation import NamedSystem
+from fitting.runtime.precision import in_float64
+from fitting.studies.fit.sentences import listed
+from fitting.studies.output import output_folder, publish
 
-from . import wrong_model
 from .replicates import (
+    ADVICE,
+    DRAWS,
+    LEVELS,
     LOG_PROBABILITY,
+    SAME_VALLEY,
+    WRITER,
+    Kind,
     ReplicateChain,
     ReplicateFit,
     chain_line,
+    claim,
     fit_line,
     fit_replicate,
+    make_replicates,
+    numbers,
     sample_replicate,
 )
-from .wrong_model import WrongModelFit, fit_wrong_model, identity_of
 
 if TYPE_CHECKING:
     from distributed import Client
 
-IDENTITY, FITS, CHAINS, WRONG_MODEL = "identity.json", "fits", "chains", "wrong_model"
-WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
-FILES = {
-    FITS: JsonFile(ReplicateFit, WRITER, ADVICE),
-    CHAINS: JsonFile(ReplicateChain, WRITER, ADVICE),
-    WRONG_MODEL: JsonFile(WrongModelFit, WRITER, ADVICE),
-}
-LINES: dict[str, Callable[[Any], str]] = {
-    FITS: fit_line,
-    CHAINS: chain_line,
-    WRONG_MODEL: wrong_model.fit_line,
-}
-WORDS = {FITS: "fits", CHAINS: "chains", WRONG_MODEL: "fits"}  # for what a stage makes
-PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
-Result = TypeVar("Result", bound=Mapping[str, Any])
+FITS = Kind("fits", "fits", JsonFile(ReplicateFit, WRITER, ADVICE), fit_line)
+CHAINS = Kind("chains", "chains", JsonFile(ReplicateChain, WRITER, ADVICE), chain_line)
+
+FAMILY_LEVEL = 0.95  # of all checks together
+FIT_LEVEL = 0.95  # of the fit's intervals
+IN_VALLEY = 0.98  # of the fits, at least
+NEAR = 0.05  # of its range: a parameter that is so near its truth has come back
 
 
-class Identity(TypedDict):
-    """What is calibrated: everything that a replicate follows from, except the program itself."""
+NUMBERS, SUMMARY = "calibration.json", "summary.md"
+RANKS, RECOVERY = "ranks.png", "recovery.png"
+LISTED = 20  # replicates, at most, where some are named
+CAME_BACK = (
+    f"A parameter came back if its fitted value is within {percent(NEAR, 0)} of its range from the "
+    "truth; counted where the fit called it determined, which promises less, so that this is not "
+    "checked."
+)
+RANKED = (
+    f"The number of {DRAWS} independent draws of the posterior that are below the truth. All ranks "
+    "are equally likely where the posterior is right. A hump means a posterior that is too wide, a "
+    "trough one that is too narrow, a slope one that is shifted."
+)
 
-    name: str
-    problem: str
-    """Digest."""
-    start: list[float]
-    seed: int
-    noise_factor: float
-    noise: Content
-    fit: Content
-    sample: Content
-    truth: NotRequired[Content]
-    """Of another system, where one makes the motion; see `wrong_model.identity_of`."""
+PAIRS_PER_ROW, PANELS_PER_ROW = 2, 4
+BINS = {100: 20, 0: 10}  # of a histogram, from so many replicates on
+BAND = "#dddddd"
 
-
-IDENTITY_FILE = JsonFile(Identity, WRITER, "name another folder")
+WIDE = 0.2  # of bounds, from which being inside them proves little
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +95,118 @@ class Calibration:
     """None, or as many as there are fits."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Assessment:
+    """All checks of a calibration, and what goes with them."""
+
+    names: tuple[str, ...]
+    """Of the parameters."""
+    replicates: int
+    level: float
+    """Of each check, so that all hold with `FAMILY_LEVEL`."""
+    fit_coverage: Proportion
+    """How often the fit's intervals contain the truth."""
+    fit_coverage_of: Mapping[str, Proportion]
+    """The same, by parameter."""
+    profile_coverage: Mapping[float, Proportion]
+    """How often narrower intervals do, by level, that the profiles of smooth parameters give."""
+    valley: Proportion
+    """How often the fit ended in the truth's valley, or a deeper one."""
+    recovery: Proportion
+    """How often a parameter that was called determined came back."""
+    recovery_of: Mapping[str, Proportion]
+    wrong: tuple[int, ...]
+    """Replicates that ended in another valley, from 1."""
+    wrong_but_converged: tuple[int, ...]
+    """Those of them that say that they converged."""
+    unconverged: tuple[int, ...]
+    ranks: Mapping[str, RankTest]
+    """Of the parameters and the log-probability; none without chains."""
+    chain_coverage: Mapping[float, Proportion]
+    """How often the posterior's central intervals contain the truth, by level."""
+    chain_coverage_of: Mapping[str, Mapping[float, Proportion]]
+    """The same, by parameter; not checked, as their ranks are."""
+    short_chains: tuple[int, ...]
+    """Replicates whose chain did not converge, or has too few independent draws."""
+
+    @property
+    def outside(self) -> list[str]:
+        """The checks that failed, in words."""
+        checks = {"the fit's 95 % intervals": self.fit_coverage.inside}
+        checks |= {
+            f"the fit's 95 % intervals of {name}": cover.inside
+            for name, cover in self.fit_coverage_of.items()
+        }
+        checks |= {
+            f"the {percent(level, 0)} intervals of profiles": cover.inside
+            for level, cover in self.profile_coverage.items()
+        }
+        checks["the share of fits in the right valley"] = self.valley.inside
+        checks |= {
+            f"the posterior's {percent(level, 0)} intervals": cover.inside
+            for level, cover in self.chain_coverage.items()
+        }
+        checks |= {f"the ranks of {name}": test.inside for name, test in self.ranks.items()}
+        return [words for words, inside in checks.items() if not inside]
+
+    @property
+    def inside(self) -> bool:
+        """Whether all checks passed."""
+        return not self.outside
+
+
+@in_float64
 def calibrate(
+    experiment: Experiment | str | Path,
+    output: str | Path | None = None,
+    *,
+    replicates: int = 200,
+    chains: bool = False,
+    noise_factor: float = 1.0,
+    workers: int = 0,
+    scheduler: str | None = None,
+) -> Assessment:
+    """Fits an experiment to motion simulated from random truths, and judges what the fits say.
+
+    Truths are drawn from the experiment's prior; each is simulated with the experiment's noise and
+    fitted as `fit` does. Each finished fit or chain is written at once, and a call with the same
+    folder continues where an interrupted one ended, also with more replicates or with chains.
+
+    Args:
+        experiment: an experiment, or the path of its file.
+        output: folder for the replicates and the report.
+        replicates: number of truths.
+        chains: whether to sample each posterior as `sample` does; a chain takes much longer than a
+            fit.
+        noise_factor: how much larger the simulated noise is than the experiment says: whether fits
+            notice, or estimate it.
+        workers: processes on this machine that compute; 0 computes in this process.
+        scheduler: address of the scheduler of a Dask cluster that computes instead.
+
+    Raises:
+        ValueError: the experiment is wrong or does not fit its clips; it is one whose noise cannot
+            be simulated; the folder holds another calibration; there is not one replicate; there
+            is no such cluster.
+    """
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(experiment)
+    with output_folder(output) as folder:
+        experiment = dataclasses.replace(with_files(experiment, folder), holdout=0.0)
+        problem = make_problem(experiment)
+        activity.log(
+            f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}"
+        )
+        with cluster.connect(workers, scheduler) as client:
+            made = make_fits_and_chains(
+                experiment, problem, folder, replicates,
+                chains=chains, noise_factor=noise_factor, client=client,
+            )  # fmt: skip
+        assessment = assess(made)
+        publish(folder, document(experiment, made, assessment))
+        return assessment
+
+
+def make_fits_and_chains(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     folder: Path | None,
@@ -98,171 +216,416 @@ def calibrate(
     noise_factor: float = 1.0,
     client: "Client | None" = None,
 ) -> Calibration:
-    """Makes the replicates that a folder does not hold yet: first all fits, then all chains.
-
-    An interrupt (Ctrl-C) loses the fit or the chain that is running and no other.
-
-    Args:
-        experiment: its settings of the search and the sampler, and the seed.
-        problem: of the experiment; its references only say which frames count.
-        folder: where finished replicates are kept. None keeps them in memory.
-        replicates: number of truths.
-        chains: whether each posterior is sampled, too.
-        noise_factor: how much larger the simulated noise is than the experiment says.
-        client: of the Dask cluster that computes. None computes in this process.
+    """The replicates of a calibration: first all fits, then all chains.
 
     Raises:
-        ValueError: there is not one replicate; the noise is not positive; the folder holds
-            something else; a replicate cannot be made.
+        ValueError: as `claim`, or a replicate cannot be made.
     """
-    _begin(folder, replicates, _identity(experiment, problem, noise_factor))
+    claim(folder, replicates, experiment, problem, noise_factor)
     names = problem.space.names
-    stage = functools.partial(_Stage, folder, replicates, client, names)
     fit = functools.partial(fit_replicate, problem, experiment, noise_factor=noise_factor)
-    fits = stage(FITS).run(fit, range(replicates))
-    if not chains:
-        return Calibration(fits, [])
+    fits = make_replicates(FITS, folder, names, fit, range(replicates), client)
     sample = functools.partial(sample_replicate, problem, experiment, noise_factor=noise_factor)
-    return Calibration(fits, stage(CHAINS).run(sample, fits))
+    sampled = make_replicates(CHAINS, folder, names, sample, fits, client) if chains else []
+    return Calibration(fits, sampled)
 
 
-def calibrate_wrong_model(
-    experiment: Experiment,
-    problem: Problem[jaxik.FootIK],
-    truth: NamedSystem,
-    folder: Path | None,
-    replicates: int,
-    *,
-    noise_factor: float = 1.0,
-    client: "Client | None" = None,
-) -> list[WrongModelFit]:
-    """Makes the replicates that a folder does not hold yet, of motion that another system makes.
-
-    Args:
-        experiment: as for `calibrate`.
-        problem: of the experiment; some of its frames are held out.
-        truth: the other system.
-        folder: as for `calibrate`.
-        replicates: number of truths.
-        noise_factor: how much larger the errors of the captures are than usual.
-        client: as for `calibrate`.
-
-    Raises:
-        ValueError: as `calibrate`, or no frame is held out.
-    """
-    if not any(np.any(scene.reference.held_out) for scene in problem.data):
-        raise ValueError(
-            f"{experiment.path}: no frame is held out, which would show what a fit under a wrong "
-            "model is worth; give `holdout` a fraction above 0, and clips 3 s or more"
-        )
-    identity = _identity(experiment, problem, noise_factor)
-    _begin(folder, replicates, {**identity, "truth": identity_of(truth)})
-    stage = _Stage(folder, replicates, client, problem.space.names, WRONG_MODEL)
-    fit = functools.partial(fit_wrong_model, problem, experiment, truth.ik)
-    return stage.run(functools.partial(fit, noise_factor=noise_factor), range(replicates))
-
-
-def _begin(folder: Path | None, replicates: int, identity: Identity) -> None:
-    """Checks what all kinds of replicates have in common, and claims the folder."""
-    if replicates < 1:
-        raise ValueError(f"replicates is {replicates}; wanted 1 or more")
-    factor = identity["noise_factor"]
-    if not 0 < factor < math.inf:
-        raise ValueError(f"noise_factor is {factor:g}; wanted a positive number")
-    if folder is not None:
-        _claim(folder, identity)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Stage:
-    """The fits, or the chains, of all replicates."""
-
-    folder: Path | None
-    replicates: int
-    client: "Client | None"
-    parameters: Sequence[str]
-    """Their names."""
-    name: str
-
-    def run(self, make: Callable[[Any], Result], arguments: Sequence[Any]) -> list[Result]:
-        """The results of all replicates; those that the folder has are not made again.
-
-        Args:
-            make: makes one from its argument.
-            arguments: of each replicate.
-        """
-        other = f"not {WRITER}: it is of replicate {{number}}"
-        store: Store[Any] = Store(FILES[self.name], self.folder, other, self._check)
-        paths = [f"{self.name}/{number:04}.json" for number in range(self.replicates)]
-        stored = [store.read(path, {"number": number}) for number, path in enumerate(paths)]
-        results: dict[int, Result] = {n: row for n, row in enumerate(stored) if row is not None}
-        missing = [number for number in range(self.replicates) if number not in results]
-        title = f"Making the {WORDS[self.name]} of {self.replicates} replicates"
-        with activity.announced(title, self.replicates, done=len(results)) as making:
-            for number, call in self._calls(make, arguments, missing):
-                with error_context(f"replicate {number + 1}"):
-                    result = call()
-                store.write(paths[number], result)
-                results[number] = result
-                activity.report(result)
-                activity.log(LINES[self.name](result))
-                making.advance()
-        return [results[number] for number in range(self.replicates)]
-
-    def _calls(
-        self, make: Callable[[Any], Result], arguments: Sequence[Any], missing: Sequence[int]
-    ) -> Iterator[tuple[int, Callable[[], Result]]]:
-        """What to call for each missing replicate, and its number; as they end on a cluster."""
-        if self.client is None:
-            for number in missing:
-                yield number, functools.partial(make, arguments[number])
-            return
-        wanted = [arguments[number] for number in missing]
-        for index, future in cluster.compute(self.client, make, wanted):
-            yield missing[index], future.result
-
-    def _check(self, result: Mapping[str, Any]) -> None:
-        """Raises ValueError for a result of other parameters, or one that contradicts itself."""
-        for key, names in self._names(result).items():
-            if sorted(names) != sorted(self.parameters):
-                raise ValueError(f"{key} has {names}; wanted {self.parameters}")
-        sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
-        if len(set(sizes.values())) > 1:
-            raise ValueError(f"its lists have different lengths, {sizes}")
-
-    def _names(self, result: Mapping[str, Any]) -> dict[str, list[str]]:
-        """The parameters of which a result says something, in each of its parts."""
-        if self.name != CHAINS:
-            return {"parameters": [row["name"] for row in result["parameters"]]}
-        ranks = set(result["ranks"]) ^ {LOG_PROBABILITY}  # which is ranked beside them
-        return {"ranks": list(ranks), "intervals": list(result["intervals"])}
+def assess(calibration: Calibration) -> Assessment:
+    """Judges all replicates of a calibration."""
+    fits, chains = calibration.fits, calibration.chains
+    names = tuple(row["name"] for row in fits[0]["parameters"])
+    smooth = np.asarray([row["kind"] == "smooth" for row in fits[0]["parameters"]])
+    inner = [nominal for nominal in LEVELS if nominal < FIT_LEVEL and smooth.any()]
+    checks = len(names) + 2 + len(inner) + (len(names) + 1 + len(LEVELS) if chains else 0)
+    level = 1 - (1 - FAMILY_LEVEL) / checks
+    levels = np.asarray([fitted["truth_levels"] for fitted in fits])[:, smooth]
+    truth = np.asarray([fitted["truth"] for fitted in fits])
+    intervals = _of_parameters(fits, "interval")
+    covered = (intervals[..., 0] <= truth) & (truth <= intervals[..., 1])
+    gaps = np.asarray([fitted["cost"] - fitted["truth_valley_cost"] for fitted in fits])
+    right = gaps <= SAME_VALLEY
+    converged = np.asarray([fitted["converged"] for fitted in fits])
+    determined = _of_parameters(fits, "determined")
+    width = _of_parameters(fits, "high") - _of_parameters(fits, "low")
+    near = np.abs(_of_parameters(fits, "value") - truth) <= NEAR * width
+    wanted = (FIT_LEVEL, FIT_LEVEL)
+    at_least = (FIT_LEVEL, 1.0)  # of a threshold, whose interval ends with a plateau of the cost
+    together = (FIT_LEVEL, float(np.where(smooth, FIT_LEVEL, 1.0).mean()))
+    chain_coverage, chain_coverage_of = _chain_coverage(chains, names, truth, level)
+    return Assessment(
+        names=names,
+        replicates=len(fits),
+        level=level,
+        fit_coverage=proportion(covered, level=level, wanted=together),
+        fit_coverage_of={
+            name: proportion(covered[:, [i]], level=level, wanted=wanted if smooth[i] else at_least)
+            for i, name in enumerate(names)
+        },
+        profile_coverage={
+            nominal: proportion(levels <= nominal, level=level, wanted=(nominal, nominal))
+            for nominal in inner
+        },
+        valley=proportion(right[:, None], level=level, wanted=(IN_VALLEY, 1.0)),
+        recovery=proportion(near, determined, level=level),
+        recovery_of={
+            name: proportion(near[:, [i]], determined[:, [i]], level=level)
+            for i, name in enumerate(names)
+        },
+        wrong=numbers(~right),
+        wrong_but_converged=numbers(~right & converged),
+        unconverged=numbers(~converged),
+        ranks={
+            name: RankTest(np.asarray([chain["ranks"][name] for chain in chains]), DRAWS, level)
+            for name in ([*names, LOG_PROBABILITY] if chains else [])
+        },
+        chain_coverage=chain_coverage,
+        chain_coverage_of=chain_coverage_of,
+        short_chains=numbers(
+            np.asarray([not chain["converged"] or chain["draws"] < DRAWS for chain in chains], bool)
+        ),
+    )
 
 
-def _claim(folder: Path, own: Identity) -> None:
-    """Writes into a folder what is calibrated there, or compares it with what is written there.
-
-    Raises:
-        ValueError: the folder is that of another calibration, or of something else.
-    """
-    if not (folder / IDENTITY).exists() and any((folder / name).exists() for name in FILES):
-        raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
-    other = "holds the calibration of {name!r}, which differs from this one in: {changed}"
-    key = {**own, "truth": own.get("truth")}
-    del key["name"]
-    Store(IDENTITY_FILE, folder, other).remember(IDENTITY, lambda: own, key)
-
-
-def _identity(
-    experiment: Experiment, problem: Problem[jaxik.FootIK], noise_factor: float
-) -> Identity:
-    identity: Identity = {
-        "name": experiment.name,
-        "problem": digest(problem),
-        "start": np.asarray(problem.space.start).tolist(),
-        "seed": experiment.seed,
-        "noise_factor": noise_factor,
-        "noise": dataclasses.asdict(experiment.noise),
-        "fit": dataclasses.asdict(experiment.fit),
-        "sample": dataclasses.asdict(experiment.sample),
+def summarise(assessment: Assessment) -> dict[str, Any]:
+    """The numbers of an assessment as `calibration.json` holds them."""
+    fields = {
+        field.name: getattr(assessment, field.name)
+        for field in dataclasses.fields(assessment)
+        if field.name != "ranks"
     }
-    return json.loads(json.dumps(identity))
+    ranks = {
+        name: {
+            "ranks": test.ranks.tolist(),
+            "draws": test.draws,
+            "inside": test.inside,
+        }
+        for name, test in assessment.ranks.items()
+    }
+    return {
+        "inside": assessment.inside,
+        "outside": assessment.outside,
+        **{name: _plain(value) for name, value in fields.items()},
+        "ranks": ranks,
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Proportion):
+        return {**dataclasses.asdict(value), "inside": value.inside}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    return value
+
+
+def _of_parameters(fits: Sequence[ReplicateFit], key: str) -> np.ndarray:
+    """One number of each parameter in each replicate, (replicates, free, ...)."""
+    return np.asarray([[row[key] for row in fitted["parameters"]] for fitted in fits])  # type: ignore[literal-required]
+
+
+def _chain_coverage(
+    chains: Sequence[ReplicateChain], names: Sequence[str], truth: np.ndarray, level: float
+) -> tuple[dict[float, Proportion], dict[str, dict[float, Proportion]]]:
+    """Of the posterior's central intervals: of all parameters together, and of each."""
+    if not chains:
+        return {}, {}
+    intervals = np.asarray([[chain["intervals"][name] for name in names] for chain in chains])
+    low, high = np.moveaxis(intervals, -1, 0)
+    covered = (low <= truth[..., None]) & (truth[..., None] <= high)
+    pooled = {
+        nominal: proportion(covered[..., k], level=level, wanted=(nominal, nominal))
+        for k, nominal in enumerate(LEVELS)
+    }
+    each = {
+        name: {
+            nominal: proportion(covered[:, [i], k], level=level, wanted=(nominal, nominal))
+            for k, nominal in enumerate(LEVELS)
+        }
+        for i, name in enumerate(names)
+    }
+    return pooled, each
+
+
+def explanation(assessment: Assessment) -> str:
+    """What was done, and what the bounds are."""
+    return (
+        "Truths were drawn from the prior, motion was simulated from them with the noise that the "
+        "experiment assumes, and each was fitted as `jaxik fit` does. Bounds are those of the "
+        f"probability behind a share, at {percent(assessment.level, 2)} each, so that with "
+        f"{percent(FAMILY_LEVEL, 0)} a program whose claims are true is inside all of them."
+    )
+
+
+def document(experiment: Experiment, calibration: Calibration, assessment: Assessment) -> Document:
+    """What a calibration says."""
+    name = experiment.name
+    fitted_title, ranks_title = (
+        f"{name}: fitted against true values",
+        f"{name}: ranks of the truths among {DRAWS} draws",
+    )
+    sections = [
+        Section(
+            "Checks",
+            [
+                Text(explanation(assessment)),
+                Grid(checks_table(assessment), "All checks"),
+                Points(remarks(assessment), brief=True),
+            ],
+        ),
+        Section(
+            "Parameters",
+            [
+                Grid(parameter_table(assessment), "What was found for each parameter"),
+                Text(CAME_BACK),
+                Plot(RECOVERY, fitted_title, lambda: recovery(calibration.fits, fitted_title)),
+            ],
+        ),
+    ]
+    if assessment.ranks:
+        plot = Plot(RANKS, ranks_title, lambda: ranks(assessment.ranks, ranks_title))
+        sections.append(Section("Ranks", [Text(RANKED), plot]))
+    return Document(
+        file=SUMMARY,
+        kind="Fits of simulated motion whose truth is known",
+        title=name,
+        verdict="Calibrated" if assessment.inside else "Not calibrated",
+        good=assessment.inside,
+        findings=findings(assessment),
+        sections=[*sections, _limits(assessment)],
+        asked=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
+        numbers={NUMBERS: {"experiment": name, **summarise(assessment)}},
+    )
+
+
+def remarks(assessment: Assessment) -> list[str]:
+    """What the tables do not say, a sentence each; nothing if there is nothing to say."""
+    sentences = {
+        f"A fit is in the right valley if its cost is at most {SAME_VALLEY:g} above where a descent"
+        f" from the truth ends; {percent(IN_VALLEY, 0)} should be. Replicates in another valley": (
+            assessment.wrong
+        ),
+        "In another valley, but said to have converged": assessment.wrong_but_converged,
+        "Fits that did not converge": assessment.unconverged,
+        f"Chains that did not converge, or have fewer than {DRAWS} independent draws": (
+            assessment.short_chains
+        ),
+    }
+    return listed_replicates(sentences)
+
+
+def listed_replicates(sentences: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """A sentence for each kind of replicates of which there are any, with their numbers."""
+    return [f"{words}: {_some_of(found)}." for words, found in sentences.items() if found]
+
+
+def _some_of(found: tuple[int, ...]) -> str:
+    shown = ", ".join(map(str, found[:LISTED]))
+    return f"{shown}{' and others' if len(found) > LISTED else ''} ({len(found)} in all)"
+
+
+def checks_table(assessment: Assessment) -> Table:
+    """A row for each claim about all parameters together."""
+    table = [["", "found", "share", "bounds", "wanted", "inside"]]
+    claimed = f"{FIT_LEVEL:.0%}".replace("%", " %")
+    cover = assessment.fit_coverage
+    table.append(share_row(f"the fit's {claimed} intervals contain the truth", cover, claimed))
+    for level, cover in assessment.profile_coverage.items():
+        claimed = percent(level, 0)
+        words = f"{claimed} intervals by the profiles of smooth parameters contain it"
+        table.append(share_row(words, cover, claimed))
+    for level, cover in assessment.chain_coverage.items():
+        claimed = percent(level, 0)
+        words = f"the posterior's {claimed} intervals contain the truth"
+        table.append(share_row(words, cover, claimed))
+    valley = f"{percent(IN_VALLEY, 0)} or more"
+    table.append(share_row("fits in the right valley", assessment.valley, valley))
+    back = "determined parameters came back"
+    table.append([*share_row(back, assessment.recovery, "")[:-1], ""])
+    return table
+
+
+def parameter_table(assessment: Assessment) -> Table:
+    """A row for each parameter, and for the log-probability where there are chains."""
+    heading = ["parameter", "came back", "the fit's 95 % intervals", "inside"]
+    levels = list(assessment.chain_coverage)
+    heading += [f"posterior's {percent(level, 0)}" for level in levels]
+    heading += ["ranks inside"] if assessment.ranks else []
+    table = [heading]
+    for name in assessment.names:
+        cover = assessment.fit_coverage_of[name]
+        recovery = assessment.recovery_of[name]
+        back = f"{recovery.hits} of {recovery.total}"
+        row = [name, back, f"{percent(cover.fraction, 0)} ({_bounds(cover)})", _verdict(cover)]
+        row += [percent(assessment.chain_coverage_of[name][level].fraction, 0) for level in levels]
+        table.append(row)
+    if assessment.ranks:
+        for row in table[1:]:
+            row.append("yes" if assessment.ranks[row[0]].inside else "**no**")
+        for name in assessment.ranks.keys() - set(assessment.names):
+            inside = "yes" if assessment.ranks[name].inside else "**no**"
+            table.append([name, *([""] * (len(heading) - 2)), inside])
+    return table
+
+
+def share_row(words: str, share: Proportion, wanted: str) -> list[str]:
+    """Cells of a claim: what was found, its share and bounds, what is wanted, whether it is so."""
+    found = f"{share.hits} of {share.total}"
+    fraction = percent(share.fraction) if share.total else "–"
+    return [words, found, fraction, _bounds(share), wanted, _verdict(share)]
+
+
+def _bounds(share: Proportion) -> str:
+    return f"{percent(share.low, 0)} to {percent(share.high, 0)}"
+
+
+def _verdict(share: Proportion) -> str:
+    """Whether a share may be what it should be, and how it differs if not."""
+    if share.inside:
+        return "yes"
+    return "**no**, too few" if share.high < share.wanted_low else "**no**, too many"
+
+
+@styled
+def ranks(tests: Mapping[str, RankTest], title: str) -> Figure:
+    """Of each quantity: the histogram of its ranks, and its ECDF less that of uniform ranks."""
+    figure, axes = panels(2 * len(tests), 2 * PAIRS_PER_ROW, title, 2.6, 1.8)
+    pairs = list(zip(axes[::2], axes[1::2], strict=True))
+    for (histogram, difference), (name, test) in zip(pairs, tests.items(), strict=True):
+        _histogram(histogram, test)
+        _difference(difference, test)
+        histogram.set_title(name)
+        if not test.inside:
+            difference.set_title("outside its band", color=CAPTURED)
+    for histogram, difference in pairs[-PAIRS_PER_ROW:]:
+        histogram.set_xlabel("rank")
+        difference.set_xlabel("rank, as a fraction")
+    (test, *_) = tests.values()
+    legend(
+        figure,
+        Patch(color=AFTER, label="left: replicates by the rank of their truth"),
+        Line2D([], [], color=AFTER, label="right: ECDF of the ranks less the uniform one"),
+        Patch(color=BAND, label=f"95 % of each bar; {100 * test.level:.2f} % of whole curves"),
+    )
+    return figure
+
+
+@styled
+def recovery(fits: Sequence[ReplicateFit], title: str) -> Figure:
+    """Of each parameter: fitted against true values, with intervals that miss the truth marked."""
+    rows = fits[0]["parameters"]
+    figure, grid = panels(len(rows), PANELS_PER_ROW, title, 4.0, 1.4)
+    for i, axes in enumerate(grid):
+        _recovered(axes, fits, i)
+    legend(
+        figure,
+        Line2D([], [], marker="o", color=AFTER, label="fitted, 95 % interval"),
+        Line2D([], [], marker="o", color=CAPTURED, label="the interval misses the truth"),
+        Line2D([], [], marker="o", linestyle="", mfc="none", color=BEFORE, label="undetermined"),
+        Line2D([], [], color="black", linewidth=0.8, label="fitted = true"),
+    )
+    return figure
+
+
+def _histogram(axes: Axes, test: RankTest) -> None:
+    bins = next(count for least, count in BINS.items() if len(test.ranks) >= least)
+    edges = np.linspace(0, test.draws + 1, bins + 1)
+    counts = np.arange(len(test.ranks) + 1)
+    below = special.bdtr(counts, len(test.ranks), 1 / bins)
+    low, high = np.searchsorted(below, [0.025, 0.975])
+    axes.axhspan(low, high, color=BAND)
+    axes.stairs(test.histogram(bins), edges, color=AFTER, fill=True, alpha=0.7)
+    axes.axhline(len(test.ranks) / bins, color="black", linewidth=0.8)
+    axes.set_xlim(0, test.draws + 1)
+    axes.grid(False)
+
+
+def _difference(axes: Axes, test: RankTest) -> None:
+    low, high = test.band - test.places
+    axes.fill_between(test.places, low, high, step="post", color=BAND, linewidth=0)
+    axes.step(test.places, test.ecdf - test.places, where="post", color=AFTER)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.set_xlim(0, 1)
+
+
+def _recovered(axes: Axes, fits: Sequence[ReplicateFit], i: int) -> None:
+    """One parameter in all replicates."""
+    first = fits[0]["parameters"][i]
+    for fitted in fits:
+        row, truth = fitted["parameters"][i], fitted["truth"][i]
+        low, high = row["interval"]
+        colour = AFTER if low <= truth <= high else CAPTURED
+        axes.plot([truth, truth], [low, high], color=colour, linewidth=0.9, alpha=0.6)
+        face = colour if row["determined"] else "none"
+        axes.plot(truth, row["value"], "o", color=colour, markersize=4, markerfacecolor=face)
+    ends = [first["low"], first["high"]]
+    axes.plot(ends, ends, color="black", linewidth=0.8)
+    unit = "" if first["unit"] == "1" else f", {first['unit']}"
+    axes.set_title(f"{first['name']}{unit}")
+    axes.locator_params(nbins=5)
+
+
+def findings(assessment: Assessment) -> list[Finding]:
+    """Whether intervals are true, whether fits find the right valley, and what comes back."""
+    return [_intervals(assessment), _valleys(assessment), _recovery(assessment)]
+
+
+def _intervals(assessment: Assessment) -> Finding:
+    cover = assessment.fit_coverage
+    count = assessment.replicates
+    motions = f"{count} simulated motion{'s' * (count != 1)}"
+    bounds = f"{percent(cover.low, 0)} to {percent(cover.high, 0)}"
+    share = percent(cover.fraction, 0)
+    coverage = f"the fit's 95 % intervals contain {share} of the true values ({bounds})"
+    if not assessment.inside:
+        return Finding(
+            f"Of {motions}, outside their bounds: {listed(assessment.outside)}; {coverage}.",
+            bad=True,
+        )
+    if cover.high - cover.low > WIDE:
+        return Finding(
+            f"Everything is inside its bounds, but {motions} prove little, as these bounds are "
+            f"wide: {coverage}.",
+            bad=True,
+        )
+    return Finding(f"On {motions} everything is inside its bounds: {coverage}.")
+
+
+def _valleys(assessment: Assessment) -> Finding:
+    valley = assessment.valley
+    text = f"{valley.hits} of {valley.total} fits end where a descent from the truth does"
+    wrong, unconverged = len(assessment.wrong_but_converged), len(assessment.unconverged)
+    short = len(assessment.short_chains)
+    faults = [
+        f"{wrong} of the others say that they converged" if wrong else "",
+        f"{unconverged} did not converge" if unconverged else "",
+        f"{short} of the chains did not converge, or are too short" if short else "",
+    ]
+    details = "; ".join(filter(None, [text, *faults]))
+    return Finding(f"{details}.", bad=any(faults))
+
+
+def _recovery(assessment: Assessment) -> Finding:
+    back = assessment.recovery
+    if not back.total:
+        return Finding("No fit called a parameter determined.", bad=True)
+    text = (
+        f"Of the parameters that fits called determined, {percent(back.fraction, 0)} came back "
+        f"within {percent(NEAR, 0)} of their range"
+    )
+    each = {name: of for name, of in assessment.recovery_of.items() if of.total}
+    least = min(each, key=lambda name: each[name].fraction)
+    if each[least].fraction < back.fraction:
+        text += f", fewest of `{least}` ({each[least].hits} of {each[least].total})"
+    never = [f"`{name}`" for name in assessment.names if not assessment.recovery_of[name].total]
+    if never:
+        text += f"; {listed(never)} {'was' if len(never) == 1 else 'were'} never determined"
+    return Finding(f"{text}.")
+
+
+def _limits(assessment: Assessment) -> Section:
+    lines = [
+        "Motion is simulated by the system itself with the noise that the experiment assumes: that "
+        "intervals are true here does not say that the system can move as people do.",
+    ]
+    if not assessment.ranks:
+        lines.append("No posterior was sampled (`--chains`), so only fits are judged.")
+    return Section("Limits of the data", [Points(lines)])

@@ -1,11 +1,22 @@
-"""One replicate: a truth drawn from the prior, motion simulated from it, and its fit.
+"""Replicates of an experiment: truths, motion made from them, and what fits say of it.
 
-Everything follows from the experiment and the number of the replicate. What a replicate was found
-to be is plain data, which JSON holds without loss.
+identity.json           what is calibrated; another experiment is refused
+fits/0000.json          the fit of a replicate
+chains/0000.json        its posterior, where chains were wanted
+wrong_model/0000.json   the fit of a replicate whose motion another system makes
+
+Everything follows from the experiment and the number of the replicate. A call continues where an
+earlier one ended, also with more replicates, or with chains for fits that have none yet. All
+replicates of a process share their compiled programs.
 """
 
 import dataclasses
-from typing import Annotated, NamedTuple, NotRequired, TypedDict
+import functools
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NotRequired, TypedDict, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,19 +34,156 @@ from fitting.inference.optimise.solution import (
 )
 from fitting.inference.profiles.profile import Profile, level_of
 from fitting.inference.sample.posterior import Posterior
-from fitting.problem.problem import Problem
+from fitting.problem.problem import Problem, digest
 from fitting.problem.simulation import simulate
 from fitting.problem.space import FreeParameter, to_fractions
-from fitting.runtime.json_files import Finite, between, length
+from fitting.runtime.json_files import Finite, JsonFile, between, length
+from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
+from fitting.studies.campaign import Campaign
 from fitting.studies.fit.assess import assess_solution, search_with_noise
 from fitting.studies.fit.fit import Fit, FittedParameter, Interval
 from fitting.studies.sample.sample import sample_around, with_open_noise
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
 LEVELS = (0.5, 0.8, 0.95)  # of a posterior's central intervals
 LOG_PROBABILITY = "log-probability"  # ranked beside the parameters
+IDENTITY = "identity.json"
+WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
+PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
+Result = TypeVar("Result")
 SAME_VALLEY = 3.0  # of cost, above the lowest that a descent from the truth reaches
+
+
+class Identity(TypedDict):
+    """What is calibrated: everything that a replicate follows from, except the program itself."""
+
+    name: str
+    problem: str
+    """Digest."""
+    start: list[float]
+    seed: int
+    noise_factor: float
+    noise: Content
+    fit: Content
+    sample: Content
+    truth: NotRequired[Content]
+    """Of another system, where one makes the motion; see `wrong_model.identity_of`."""
+
+
+IDENTITY_FILE = JsonFile(Identity, WRITER, "name another folder")
+
+
+class Kind(NamedTuple):
+    """What is made of each replicate: a fit, or a chain."""
+
+    folder: str
+    word: str
+    """For several of it."""
+    file: JsonFile[Any]
+    line: Callable[[Any], str]
+    """One of it, for the reader."""
+
+
+def claim(
+    folder: Path | None,
+    replicates: int,
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    noise_factor: float,
+    truth: Content | None = None,
+) -> None:
+    """Writes into a folder what is calibrated there, or compares it with what is written there.
+
+    Raises:
+        ValueError: there is not one replicate; the noise is not positive; the folder is that of
+            another calibration, or of something else.
+    """
+    if replicates < 1:
+        raise ValueError(f"replicates is {replicates}; wanted 1 or more")
+    if not 0 < noise_factor < math.inf:
+        raise ValueError(f"noise_factor is {noise_factor:g}; wanted a positive number")
+    if folder is None:
+        return
+    if not (folder / IDENTITY).exists() and any(folder.glob("*/[0-9]*.json")):
+        raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
+    identity = {
+        "name": experiment.name,
+        "problem": digest(problem),
+        "start": np.asarray(problem.space.start).tolist(),
+        "seed": experiment.seed,
+        "noise_factor": noise_factor,
+        **{key: dataclasses.asdict(getattr(experiment, key)) for key in ("noise", "fit", "sample")},
+        **({} if truth is None else {"truth": truth}),
+    }
+    own: Identity = json.loads(json.dumps(identity))
+    other = "holds the calibration of {name!r}, which differs from this one in: {changed}"
+    key = {**own, "truth": truth}
+    del key["name"]
+    Store(IDENTITY_FILE, folder, other).remember(IDENTITY, lambda: own, key)
+
+
+def make_replicates(
+    kind: Kind,
+    folder: Path | None,
+    parameters: Sequence[str],
+    make: Callable[[Any], Result],
+    sources: Sequence[Any],
+    client: "Client | None" = None,
+) -> list[Result]:
+    """All replicates, of which those are made that a folder does not hold yet.
+
+    Args:
+        kind: of what is made.
+        folder: of the replicates, if they are stored.
+        parameters: names of those that are fitted.
+        make: makes one from its source.
+        sources: of each replicate, its number or its fit.
+        client: of the Dask cluster that computes. None computes in this process.
+    """
+    check = functools.partial(_check, parameters)
+    other = f"not {WRITER}: it is of replicate {{number}}"
+    store: Store[Any] = Store(kind.file, folder, other, check)
+
+    def path(source: Any) -> str:
+        return f"{kind.folder}/{_number(source):04}.json"
+
+    return Campaign(
+        f"Making the {kind.word} of {len(sources)} replicates",
+        sources,
+        make,
+        lambda source: store.read(path(source), {"number": _number(source)}),
+        lambda source, result: store.write(path(source), result),
+        kind.line,
+        lambda source: f"replicate {_number(source) + 1}",
+    ).run(client)
+
+
+def _number(source: int | Mapping[str, Any]) -> int:
+    return source if isinstance(source, int) else source["number"]
+
+
+def _check(parameters: Sequence[str], result: Mapping[str, Any]) -> None:
+    """Raises ValueError for a result of other parameters, or one that contradicts itself."""
+    if "ranks" in result:
+        ranked = list(set(result["ranks"]) ^ {LOG_PROBABILITY})
+        parts = {"ranks": ranked, "intervals": list(result["intervals"])}
+    else:
+        parts = {"parameters": [row["name"] for row in result["parameters"]]}
+    for key, names in parts.items():
+        if sorted(names) != sorted(parameters):
+            raise ValueError(f"{key} has {names}; wanted {parameters}")
+    sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"its lists have different lengths, {sizes}")
+
+
+def numbers(where: np.ndarray) -> tuple[int, ...]:
+    """Replicates for which something holds, counted from 1."""
+    return tuple(int(i) + 1 for i in np.flatnonzero(where))
 
 
 class Truth(NamedTuple):
@@ -107,17 +255,10 @@ def fit_replicate(
     number: int,
     noise_factor: float = 1.0,
 ) -> ReplicateFit:
-    """Fits a replicate as `jaxik fit` does, and descends from its truth.
-
-    Args:
-        problem: of the experiment.
-        experiment: its settings of the search, and the seed.
-        number: of the replicate, from 0.
-        noise_factor: how much larger the simulated noise is than what the problem assumes.
+    """Fits a replicate, counted from 0, as `jaxik fit` does, and descends from its truth.
 
     Raises:
-        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
-        ValueError: the fit cannot be assessed.
+        KeyboardInterrupt, ValueError: as `fit_simulated`.
     """
     truth = draw_truth(problem, experiment, number)
     simulated = _simulated(problem, truth, noise_factor)
@@ -142,11 +283,7 @@ def fit_simulated(
     simulated: Problem[jaxik.FootIK],
     experiment: Experiment,
 ) -> Fit:
-    """Fits simulated motion as `jaxik fit` does.
-
-    Args:
-        simulated: the problem of the experiment, with this motion.
-        experiment: its settings of the search, with the seed of the replicate.
+    """Fits a problem of simulated motion as `jaxik fit` does.
 
     Raises:
         KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.

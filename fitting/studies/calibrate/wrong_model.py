@@ -1,11 +1,9 @@
-"""A replicate under a wrong model: another system makes the motion, and it is captured with errors.
+"""Calibration under a wrong model: another system makes the motion, captured with errors.
 
 No value of the fitted parameters is true, then. What a fit says of its motion still must be: on
-frames that were held out, against the capture and against the motion that has no errors.
-
-Errors as captures have them: slow, constant, sudden, and of people who are no system.
-
-None of them is the noise that a fit assumes, which is independent of frame and joint.
+frames that were held out, against the capture and against the motion that has no errors. Errors are
+those of captures: slow, constant, sudden, and of people, who are no system. None of them is the
+noise that a fit assumes, which is independent of frame and joint.
 
 Nobody sees differences as small as `UNSEEN`. So a verdict is true unless it is contradicted by
 more: one that says "fits" where the motion without errors is further off than what looks the same,
@@ -16,8 +14,10 @@ without its noise and jumps.
 
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypedDict, cast
 
 import equinox as eqx
@@ -30,21 +30,51 @@ import jaxik
 from fitting.clips import contacts, edit
 from fitting.experiment import systems
 from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
+from fitting.experiment.in_memory import with_files
+from fitting.experiment.problems import load_clips, problem_from_clips
 from fitting.inference import sensitivity
 from fitting.inference.proportions import Proportion, proportion
-from fitting.motion.goodness import CLOSE, UNSEEN, Distances, Kinds, Motion, Part, size
+from fitting.motion.goodness import (
+    CLOSE,
+    NAMES,
+    PART_NAMES,
+    UNSEEN,
+    Distances,
+    Kinds,
+    Motion,
+    Part,
+    describe_distances,
+    size,
+)
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from fitting.problem.simulation import displaced, with_motion_of
 from fitting.problem.space import free_parameter, make_space, present_value
-from fitting.runtime.json_files import Finite
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Points, Section, Text
+from fitting.report.formatting import Table, percent
+from fitting.runtime import activity, cluster
+from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import Content
 from fitting.studies.fit.fit import Fit
-from fitting.studies.translation import NamedSystem
+from fitting.studies.output import output_folder, publish
+from fitting.studies.translation import NamedSystem, load_named_system
 from jaxik.world.skeleton import Transform
 
-from .replicates import Outcome, fit_simulated, outcome
+from .calibration import NUMBERS, SUMMARY, WIDE, listed_replicates, share_row
+from .replicates import (
+    ADVICE,
+    WRITER,
+    Kind,
+    Outcome,
+    claim,
+    fit_simulated,
+    make_replicates,
+    numbers,
+    outcome,
+)
 
 SPREAD = 0.3  # of u, in which the truth's parameters are drawn around the values of the system
 
@@ -62,6 +92,25 @@ SWING_SPEED = 0.4  # m/s, of an animated ankle, above which its foot swings
 KNEE_SHARE = 0.5  # of the ankle's deviation in a swing
 
 Series = Float[np.ndarray, "frames ..."]
+
+
+MOTIONS = {
+    "animation": "the flat animation",
+    "before": "the system before the fit",
+    "fitted": "the fitted system",
+    "kept": "the kept system",
+}
+COVERED = (
+    "How often the fit's 95 % intervals contain the value of the system that made the motion, for "
+    "parameters that both have. Nothing says that they should: under a wrong model a parameter "
+    "also does the work of what the system lacks."
+)
+
+LIMITS = [
+    "Errors and truths are drawn at random, and sizes of errors are those of a careful capture: a "
+    "worse one, or a person who walks as no system does, may leave more.",
+    "A part that is held out goes on with the same walk over the same ground.",
+]
 
 
 class KindDistances(TypedDict):
@@ -111,19 +160,131 @@ class WrongModelFit(Outcome):
     """The same fit against the motion without errors."""
 
 
+def fit_line(fitted: WrongModelFit) -> str:
+    """A finished fit in one line, for the terminal."""
+    distances = distances_of(fitted["captured"])
+    motions = distances.parts["held_out"]
+    kept = "" if distances.better == "fitted" else ", not kept"
+    return (
+        f"replicate {fitted['number'] + 1}: {word(fitted['captured'])}"
+        f"{'' if is_true(fitted) else ', which is not true'}{kept}; held out: ankles "
+        f"{size('ankle', motions['fitted']['ankle'])}, without foot IK "
+        f"{size('ankle', motions['animation']['ankle'])}; {fitted['seconds']:.1f} s"
+    )
+
+
+WRONG_MODEL = Kind("wrong_model", "fits", JsonFile(WrongModelFit, WRITER, ADVICE), fit_line)
+
+
+@dataclasses.dataclass(frozen=True)
+class WrongModelAssessment:
+    """What was found, on frames that were held out unless a field says otherwise."""
+
+    replicates: int
+    kept_no_worse: Proportion
+    """How often the kept system is no further from the capture than the flat animation: by the root
+    mean square over ankles, knees and pelvis."""
+    kept_no_worse_anywhere: Proportion
+    """How often no kind of joint is, and the orientation of the feet neither."""
+    kept_no_worse_noise_free: Proportion
+    """The first again, against the motion without errors."""
+    fitted_no_worse: Proportion
+    """The first again, of the fitted system, kept or not."""
+    verdicts: Proportion
+    """How often the verdict is true."""
+    verdicts_of: Mapping[str, Proportion]
+    """The same, by what it says."""
+    coverage_of: Mapping[str, Proportion]
+    """How often the fit's 95 % intervals contain the value of the system that made the motion, by
+    parameter that both have; nothing that they should."""
+    medians: Mapping[str, Mapping[str, float]]
+    """m or rad, of the distances from the motion without errors, by motion and kind of joint."""
+    worse: tuple[int, ...]
+    """Replicates whose kept system is worse than the animation, from 1."""
+    false: tuple[int, ...]
+    """Replicates whose verdict is not true."""
+    unconverged: tuple[int, ...]
+
+    @property
+    def outside(self) -> list[str]:
+        """The checks that failed, in words."""
+        checks = {
+            "the kept system against the animation": self.kept_no_worse.inside,
+            "the share of true verdicts": self.verdicts.inside,
+        }
+        return [words for words, inside in checks.items() if not inside]
+
+    @property
+    def inside(self) -> bool:
+        """Whether all checks passed."""
+        return not self.outside
+
+
+@in_float64
+def calibrate_wrong_model(
+    experiment: Experiment | str | Path,
+    truth: str,
+    output: str | Path | None = None,
+    *,
+    replicates: int = 200,
+    noise_factor: float = 1.0,
+    workers: int = 0,
+    scheduler: str | None = None,
+) -> WrongModelAssessment:
+    """Fits an experiment to motion that another system makes, and judges what the fits say.
+
+    Truths are drawn around the parameters of that system; each of their motions is captured with
+    errors that a real capture has, and fitted as `fit` does, with a part held out. A call with the
+    same folder continues where an interrupted one ended, as for `calibrate`.
+
+    Args:
+        experiment: an experiment, or the path of its file.
+        truth: the system that makes the motion: a preset or a parameter .toml.
+        output: folder for the replicates and the report.
+        replicates: number of truths.
+        noise_factor: how much larger the errors of the captures are than usual.
+        workers: as for `calibrate`.
+        scheduler: as for `calibrate`.
+
+    Raises:
+        ValueError: as `calibrate`; there is no such system; no frame is held out.
+    """
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(experiment)
+    with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
+        clips = load_clips(experiment)
+        rig = clips[0].base.rig if experiment.body == "clip" else None
+        system = load_named_system(truth, "truth", rig)
+        if any(clip.root.rise is not None for clip in clips):
+            system = dataclasses.replace(system, ik=systems.without_own_root(system.ik))
+        problem = problem_from_clips(experiment, clips)
+        activity.log(f"{replicates} motions of {system.name}, fitted by {experiment.preset}")
+        if not any(np.any(scene.reference.held_out) for scene in problem.data):
+            raise ValueError(
+                f"{experiment.path}: no frame is held out, which would show what a fit under a "
+                "wrong model is worth; give `holdout` a fraction above 0, and clips 3 s or more"
+            )
+        claim(folder, replicates, experiment, problem, noise_factor, identity_of(system))
+        fit = functools.partial(
+            fit_wrong_model, problem, experiment, system.ik, noise_factor=noise_factor
+        )
+        names, numbered = problem.space.names, range(replicates)
+        with cluster.connect(workers, scheduler) as client:
+            fits = make_replicates(WRONG_MODEL, folder, names, fit, numbered, client)
+        assessment = assess(fits)
+        publish(folder, document(experiment, system.name, fits, assessment))
+        return assessment
+
+
 @in_float64
 def draw_system(
     truth: jaxik.FootIK, rig: jaxik.Rig | None, random: np.random.Generator
 ) -> tuple[jaxik.FootIK, dict[str, float]]:
-    """A system near the given one, and its parameters by name.
+    """A system near the given one, and its parameters by name, over ranges of the rig or the adult.
 
     What is 0 stays 0, and what is at a bound stays there: both mean that something is off. Vectors
     stay, as they are places on the body, and so does what another parameter stays above.
-
-    Args:
-        truth: the system.
-        rig: whose body its ranges are for; None is the adult.
-        random: what it is drawn from.
     """
     table = sensitivity.all_parameters(truth, rig)
     numbers = [name for name in table if present_value(truth, name) and "[" not in name]
@@ -143,18 +304,10 @@ def fit_wrong_model(
     number: int,
     noise_factor: float = 1.0,
 ) -> WrongModelFit:
-    """Fits the motion of another system, captured with errors, as `jaxik fit` does.
-
-    Args:
-        problem: of the experiment.
-        experiment: its settings of the search, and the seed.
-        truth: the other system, around which the truth of the replicate is drawn.
-        number: of the replicate, from 0.
-        noise_factor: how much larger the errors are than usual.
+    """Fits a replicate, of a system around `truth` captured with errors, as `jaxik fit` does.
 
     Raises:
-        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
-        ValueError: the fit cannot be assessed.
+        KeyboardInterrupt, ValueError: as `fit_simulated`.
     """
     random = np.random.default_rng([experiment.seed, number])
     rig = problem.data[0].rig if experiment.body == "clip" else None
@@ -210,50 +363,6 @@ def identity_of(truth: NamedSystem) -> Content:
     return {"name": truth.name, "rules": systems.rule_names(truth.ik), "values": leaves}
 
 
-@dataclasses.dataclass(frozen=True)
-class WrongModelAssessment:
-    """What was found, on frames that were held out unless a field says otherwise."""
-
-    replicates: int
-    kept_no_worse: Proportion
-    """How often the kept system is no further from the capture than the flat animation: by the root
-    mean square over ankles, knees and pelvis."""
-    kept_no_worse_anywhere: Proportion
-    """How often no kind of joint is, and the orientation of the feet neither."""
-    kept_no_worse_noise_free: Proportion
-    """The first again, against the motion without errors."""
-    fitted_no_worse: Proportion
-    """The first again, of the fitted system, kept or not."""
-    verdicts: Proportion
-    """How often the verdict is true."""
-    verdicts_of: Mapping[str, Proportion]
-    """The same, by what it says."""
-    coverage_of: Mapping[str, Proportion]
-    """How often the fit's 95 % intervals contain the value of the system that made the motion, by
-    parameter that both have; nothing that they should."""
-    medians: Mapping[str, Mapping[str, float]]
-    """m or rad, of the distances from the motion without errors, by motion and kind of joint."""
-    worse: tuple[int, ...]
-    """Replicates whose kept system is worse than the animation, from 1."""
-    false: tuple[int, ...]
-    """Replicates whose verdict is not true."""
-    unconverged: tuple[int, ...]
-
-    @property
-    def outside(self) -> list[str]:
-        """The checks that failed, in words."""
-        checks = {
-            "the kept system against the animation": self.kept_no_worse.inside,
-            "the share of true verdicts": self.verdicts.inside,
-        }
-        return [words for words, inside in checks.items() if not inside]
-
-    @property
-    def inside(self) -> bool:
-        """Whether all checks passed."""
-        return not self.outside
-
-
 def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
     """Judges all replicates of a calibration under a wrong model."""
     captured = [distances_of(fit["captured"]) for fit in fits]
@@ -275,9 +384,9 @@ def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
         verdicts_of={said: _share(true[words == said]) for said in WORDS},
         coverage_of=_coverage(fits),
         medians=_medians(noise_free, kept),
-        worse=_numbers(~kept_no_worse),
-        false=_numbers(~true),
-        unconverged=_numbers([not fit["converged"] for fit in fits]),
+        worse=numbers(~kept_no_worse),
+        false=numbers(~true),
+        unconverged=numbers(np.array([not fit["converged"] for fit in fits])),
     )
 
 
@@ -303,19 +412,6 @@ def is_true(fit: WrongModelFit) -> bool:
 def distances_of(judgement: Judgement) -> Distances:
     """The distances as they were before a file held them."""
     return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], judgement["distances"]))
-
-
-def fit_line(fitted: WrongModelFit) -> str:
-    """A finished fit in one line, for the terminal."""
-    distances = distances_of(fitted["captured"])
-    motions = distances.parts["held_out"]
-    kept = "" if distances.better == "fitted" else ", not kept"
-    return (
-        f"replicate {fitted['number'] + 1}: {word(fitted['captured'])}"
-        f"{'' if is_true(fitted) else ', which is not true'}{kept}; held out: ankles "
-        f"{size('ankle', motions['fitted']['ankle'])}, without foot IK "
-        f"{size('ankle', motions['animation']['ankle'])}; {fitted['seconds']:.1f} s"
-    )
 
 
 def summarise(assessment: WrongModelAssessment) -> dict[str, Any]:
@@ -380,11 +476,6 @@ def _medians(distances: Sequence[Distances], kept: Sequence[Motion]) -> dict[str
     }
 
 
-def _numbers(where: Any) -> tuple[int, ...]:
-    """Replicates, counted from 1."""
-    return tuple(int(i) + 1 for i in np.flatnonzero(where))
-
-
 @dataclasses.dataclass(frozen=True)
 class ErrorSizes:
     """How large the errors of a capture are."""
@@ -418,13 +509,9 @@ def with_errors(
     mask_pops: Sequence[bool],
     random: np.random.Generator,
 ) -> Problem[jaxik.FootIK]:
-    """The problem with errors in its references.
+    """The problem with errors in its references, which have none.
 
-    Args:
-        problem: whose references have none.
-        sizes: of the errors.
-        mask_pops: of each clip, whether frames in which a joint jumps are left out, as in a fit.
-        random: what they are drawn from.
+    Where `mask_pops` says so of a clip, frames in which a joint jumps are left out, as in a fit.
     """
     scenes = tuple(
         _with_errors(scene, sizes, masked, random)
@@ -476,12 +563,8 @@ def floor_drift(time: Series, size: float, random: np.random.Generator) -> Serie
 def swing_deviation(speed: Series, size: float, random: np.random.Generator) -> Series:
     """How far each ankle is off its path, m, (frames, legs, 3): smooth, and 0 while a foot stands.
 
-    Each swing has a direction of its own.
-
-    Args:
-        speed: of the animated ankles, m/s, (frames, legs).
-        size: m, in mid-swing.
-        random: what directions are drawn from.
+    Each swing has a direction of its own, and its size, m, in mid-swing; the speed of the animated
+    ankles, m/s, (frames, legs), says when a foot swings.
     """
     deviation = np.zeros((*speed.shape, 3))
     for leg, moving in enumerate((speed > SWING_SPEED).T):
@@ -496,13 +579,9 @@ def swing_deviation(speed: Series, size: float, random: np.random.Generator) -> 
 def pops(
     shape: tuple[int, int, int], time: Series, size: float, random: np.random.Generator
 ) -> Series:
-    """Jumps, m, of single joints for a few frames, as a marker's that is mistaken for another.
+    """Jumps of `size`, m, of single joints for a few frames, as of a marker mistaken for another.
 
-    Args:
-        shape: frames, joints, 3.
-        time: s.
-        size: m.
-        random: what they are drawn from.
+    The shape is (frames, joints, 3), the time in s.
     """
     frames, joints, _ = shape
     jumps = np.zeros(shape)
@@ -516,3 +595,140 @@ def pops(
 
 def _displaced(joint: Transform, shift: Series, turn: Float[np.ndarray, "*joints 3"]) -> Transform:
     return displaced(joint, shift, np.broadcast_to(turn, shift.shape))
+
+
+def sentence(assessment: WrongModelAssessment) -> str:
+    """What was found, in two sentences."""
+    count = assessment.replicates
+    motions = f"{count} motion{'s' * (count != 1)} of another system"
+    kept, true = assessment.kept_no_worse, assessment.verdicts
+    shares = (
+        f"The kept system is no worse than the animation in {kept.hits} of {kept.total} cases, and "
+        f"{true.hits} of {true.total} verdicts are true."
+    )
+    if assessment.inside:
+        return f"True under a wrong model: on {motions} everything is inside its bounds. {shares}"
+    outside = " and ".join(assessment.outside)
+    return f"Not true under a wrong model: on {motions}, outside their bounds: {outside}. {shares}"
+
+
+def explanation(truth: str) -> str:
+    """What was done, and what the words mean."""
+    unseen = ", ".join(f"{NAMES[kind]} {size(kind, value)}" for kind, value in UNSEEN.items())
+    return (
+        f"Systems were drawn around `{truth}`, and their motion was captured with errors: a drift "
+        "of the floor, constant offsets of joints, jumps of markers, swings as no system makes "
+        "them, and noise. Each was fitted as `jaxik fit` does; distances are those on frames that "
+        "were held out. A motion is worse if it is further off by more than "
+        f"{1000 * WORSE:.0f} mm, the root mean square over ankles, knees and pelvis. A verdict is "
+        "true unless the motion without errors contradicts it by more than nobody sees "
+        f'({unseen}): one that says "fits" if this motion is further off than what looks the same '
+        f'({describe_distances(CLOSE)}) or the fit has made it worse, "worse" if the distance that '
+        'it names is not larger than the other. "Does not fit" is said of the capture, whose drift '
+        "and offsets no system has: it is false if the capture without noise and jumps is nearer "
+        "everywhere. "
+        f"Bounds are those of the probability behind a share, at {percent(LEVEL, 0)}."
+    )
+
+
+def checks_table(assessment: WrongModelAssessment) -> Table:
+    """A row for each claim, checked ones first."""
+    rows = [["", "found", "share", "bounds", "wanted", "inside"]]
+    wanted = f"{percent(TRUE_VERDICTS, 0)} or more"
+    rows.append(
+        share_row("the kept system no worse than the animation", assessment.kept_no_worse, "all")
+    )
+    rows.append(share_row("true verdicts", assessment.verdicts, wanted))
+    others = {
+        f'true where the verdict is "{said}"': of for said, of in assessment.verdicts_of.items()
+    }
+    others |= {
+        "the kept system no worse, by the motion without errors": (
+            assessment.kept_no_worse_noise_free
+        ),
+        "the kept system no worse in any kind of joint": assessment.kept_no_worse_anywhere,
+        "the fitted system no worse, kept or not": assessment.fitted_no_worse,
+    }
+    return rows + [[*share_row(words, of, "")[:-1], ""] for words, of in others.items()]
+
+
+def distances_table(assessment: WrongModelAssessment) -> Table:
+    """A row for each motion: medians of its distances."""
+    rows = [["median off the motion without errors", *(NAMES[kind] for kind in CLOSE)]]
+    for motion, kinds in assessment.medians.items():
+        rows.append([MOTIONS[motion], *(size(kind, kinds[kind]) for kind in CLOSE)])
+    return rows
+
+
+def coverage_table(assessment: WrongModelAssessment) -> Table:
+    """A row for each parameter that both systems have."""
+    rows = [["parameter", "found", "share", "bounds"]]
+    for name, of in assessment.coverage_of.items():
+        rows.append(share_row(name, of, "")[:4])
+    return rows
+
+
+def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> list[str]:
+    """What the tables do not say, a sentence each; nothing if there is nothing to say."""
+    sentences = {
+        "The kept system is worse than the animation in replicates": assessment.worse,
+        "The verdict is not true in replicates": assessment.false,
+        "Fits that did not converge": assessment.unconverged,
+    }
+    lines = listed_replicates(sentences)
+    for number in assessment.false:
+        fitted = fits[number - 1]
+        off = "; ".join(
+            f"{describe_distances(motions['fitted'])} in {PART_NAMES[part]}"
+            for part, motions in distances_of(fitted["noise_free"]).parts.items()
+        )
+        said = fitted["captured"]["sentence"]
+        lines.append(f'Replicate {number} says: "{said}" Without errors: {off}.')
+    return lines
+
+
+def document(
+    experiment: Experiment,
+    truth: str,
+    fits: Sequence[WrongModelFit],
+    assessment: WrongModelAssessment,
+) -> Document:
+    """What a calibration under a wrong model says."""
+    checks = [
+        Text(explanation(truth)),
+        Grid(checks_table(assessment), "All checks"),
+        Points(remarks(assessment, fits), brief=True),
+    ]
+    sections = [
+        Section("Checks", checks),
+        Section("Distances", [Grid(distances_table(assessment), "Distances by motion")]),
+    ]
+    if assessment.coverage_of:
+        covered = Grid(coverage_table(assessment), "Intervals of shared parameters")
+        sections.append(Section("Parameters of both systems", [Text(COVERED), covered]))
+    return Document(
+        file=SUMMARY,
+        kind="Fits of motion that another system makes",
+        title=experiment.name,
+        verdict="True" if assessment.inside else "Not true",
+        good=assessment.inside,
+        findings=_findings(assessment),
+        sections=[*sections, Section("Limits of the data", [Points(LIMITS)])],
+        asked=[
+            *pages.rows(experiment),
+            ["Made by", truth],
+            ["Simulated motions", f"{assessment.replicates}"],
+        ],
+        numbers={NUMBERS: {"experiment": experiment.name, "truth": truth, **summarise(assessment)}},
+    )
+
+
+def _findings(assessment: WrongModelAssessment) -> list[Finding]:
+    """What was found, and whether there are too few motions for it."""
+    found = Finding(sentence(assessment), bad=not assessment.inside)
+    true = assessment.verdicts
+    if true.high - true.low <= WIDE:
+        return [found]
+    bounds = f"{percent(true.low, 0)} to {percent(true.high, 0)}"
+    few = f"So few motions prove little: the share of true verdicts may be {bounds}."
+    return [found, Finding(few, bad=True)]

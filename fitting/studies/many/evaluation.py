@@ -229,12 +229,7 @@ def _along(
 ) -> dict[str, Array]:
     """What systems make of a clip, or a system of clips, shared out among devices.
 
-    Args:
-        measure: what is kept.
-        mesh: the devices.
-        stacked: which arrays of system and clip have an axis of the batch; None for none.
-        ik: systems.
-        scene: clips.
+    `stacked` says which arrays of system and clip have an axis of the batch; None for none.
     """
     arguments = tuple(zip((ik, scene), stacked, strict=True))
     in_axes = tuple(flags and shared_world.labelled(tree, flags, 0) for tree, flags in arguments)

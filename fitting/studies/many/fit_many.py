@@ -1,9 +1,10 @@
 """The job that fits clips × experiments × seeds, each in a run folder of its own."""
 
 import functools
+import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import program_key
 from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
+from fitting.studies.campaign import Campaign
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit
 from fitting.studies.fit.fit_jobs import Loaded, fit
@@ -25,17 +27,16 @@ from fitting.studies.output import output_folder, publish
 
 from . import many_report, many_tasks
 from .many_tasks import (
+    ROW,
     RUNS,
     FitTask,
     ManyFits,
     Row,
-    Tally,
-    failed_row,
-    finished_row,
+    make_row,
     outcome_of,
     plan,
     read_row,
-    write_row,
+    row_store,
 )
 
 if TYPE_CHECKING:
@@ -89,22 +90,31 @@ def fit_many(
         folder = folder.absolute()
         inputs = folder / INPUTS
         loaded = [with_files(entry, inputs / f"{number}") for number, entry in enumerate(loaded, 1)]
-        tasks = plan(loaded, seeds, together=together)
-        with activity.announced(f"Looking for finished fits among {len(tasks)}"):
-            tally = Tally(folder, tasks)
-        activity.log(many_report.plan_line(len(loaded), len(tasks), len(tally.missing), seeds))
+        tasks, began = plan(loaded, seeds, together=together), time.monotonic()
+        count = len(tasks)
+        with activity.announced(f"Looking for finished fits among {count}"):
+            campaign = Campaign(
+                f"Making {count} fit{'s' * (count != 1)}",
+                tasks,
+                functools.partial(fit_task, folder, report=report),
+                functools.partial(read_row, folder),
+                line=many_report.row_line,
+                name=lambda task: task.run.as_posix(),
+                failed=lambda task, error: make_row(task, in_one_line(error)),
+            )
+        missing, interrupted = len(campaign.missing), False
+        activity.log(many_report.plan_line(len(loaded), count, missing, seeds))
         if workers is None and scheduler is None:
             workers = usable_cores()
-        interrupted = False
         try:
-            with _connected(len(tally.missing), workers, scheduler) as client:
-                make = functools.partial(fit_task, folder, report=report)
-                _compute(client, make, tally)
+            with _connected(missing, workers, scheduler) as client:
+                campaign.run(client)
         except KeyboardInterrupt:
             interrupted = True
-            tally.look_again()
+            campaign.look()  # a row may have been written, and not come back
             activity.log("interrupted; writing the table of the finished fits")
-        fits = tally.fits(interrupted=interrupted)
+        rows, made = tuple(campaign.finished()), missing - len(campaign.missing)
+        fits = ManyFits(rows, count, folder, time.monotonic() - began, made, interrupted)
         _write(fits, loaded)
         return fits
 
@@ -140,18 +150,6 @@ def _connected(
         yield client
 
 
-def _compute(client: "Client | None", make: Callable[[FitTask], Row], tally: Tally) -> None:
-    """Makes the missing fits, and tells of each as it ends."""
-    total, missing = len(tally.tasks), tally.missing
-    title = f"Making {total} fit{'s' * (total != 1)}"
-    with activity.announced(title, total, done=total - len(missing)) as fitting:
-        for row in _computed(client, make, missing):
-            tally.add(row)
-            activity.log(many_report.row_line(row))
-            fitting.advance()
-            activity.report(row, f"{tally.failed} failed" if tally.failed else "")
-
-
 def _log_dashboard(client: "Client") -> None:
     """Logs where Dask shows its workers, or what is missing for that."""
     if cluster.has_dashboard():
@@ -171,20 +169,6 @@ def _workers_line(hosts: Sequence[str], scheduler: str) -> str:
     )
 
 
-def _computed(
-    client: "Client | None", make: Callable[[FitTask], Row], tasks: Sequence[FitTask]
-) -> Iterator[Row]:
-    """The rows of these tasks as they end, of whatever process."""
-    if client is None:
-        yield from map(make, tasks)
-        return
-    for index, future in cluster.compute(client, make, tasks):
-        try:
-            yield future.result()
-        except Exception as error:  # its workers died one after another
-            yield failed_row(tasks[index], in_one_line(error))
-
-
 def _write(fits: ManyFits, experiments: Sequence[Experiment]) -> None:
     """The table, the picture and the page of what there is, and what the terminal shows."""
     written: Sequence[str] = ()
@@ -197,18 +181,18 @@ def _write(fits: ManyFits, experiments: Sequence[Experiment]) -> None:
     publish(folder, many_report.document(fits, experiments, written))
 
 
+class FailedError(RuntimeError):
+    """A fit has failed; the message says why, in one line."""
+
+
 def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
     """Makes one fit as `fit` does, and says at last that its run folder is whole.
 
-    An error becomes its row. The first fit with certain programs keeps others of this machine that
-    need the same ones waiting until it has compiled them.
-
-    Args:
-        folder: of all fits; it exists already, also where another machine made it.
-        task: the fit.
-        report: whether the run gets tables, pictures and a page.
+    The first fit with certain programs keeps others of this machine that need the same ones waiting
+    until it has compiled them. The folder of all fits exists, also where another machine made it.
 
     Raises:
+        FailedError: the fit could not be made.
         KeyboardInterrupt: it was interrupted; half a fit counts for nothing.
     """
     watch, run = Stopwatch(), folder / task.run
@@ -219,16 +203,17 @@ def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
                 return row  # of another worker that was thought to be dead
             warnings.simplefilter("default")
             fitted = _fit(run, task.experiment, report, watch)
-        notes = list(dict.fromkeys(in_one_line(Warning(note.message)) for note in caught))
-        row = finished_row(task, outcome_of(fitted), watch.read(), notes)
+        row = make_row(task)
+        row["notes"] = list(dict.fromkeys(in_one_line(Warning(note.message)) for note in caught))
+        row["outcome"], row["effort"] = outcome_of(fitted), watch.read()
         (run / ERROR).unlink(missing_ok=True)
-        write_row(folder, row)
+        row_store(folder).write(f"{row['run']}/{ROW}", row)
         return row
     except Exception as error:
         if not isinstance(error, ValueError | OSError):  # which are told in a sentence
             run.mkdir(parents=True, exist_ok=True)
             files.write_text(run / ERROR, "".join(traceback.format_exception(error)))
-        return failed_row(task, in_one_line(error))
+        raise FailedError(in_one_line(error)) from None
 
 
 class _Wait(activity.Watcher):

@@ -13,7 +13,7 @@ from fitting.experiment.experiment import Experiment
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, number, percent
-from fitting.report.style import AFTER, BEFORE, CAPTURED, styled
+from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.studies.fit.sentences import listed
 
 from .many_tasks import FittedValue, ManyFits, Row
@@ -56,25 +56,14 @@ def row_line(row: Row) -> str:
     return f"{row['run']}: cost {number(outcome['cost'])}{seconds}{state}"
 
 
-def misfits(fits: ManyFits) -> int:
-    """How many finished fits leave more of the motion over than noise of the given sigmas."""
-    return sum(not row["outcome"]["fits"] for row in fits.finished if "outcome" in row)
-
-
 def parameter_table(fits: ManyFits) -> Table:
     """A row for each parameter of each experiment: where its fitted values lie."""
     rows = [["experiment", "parameter", "unit", "median", "10 %", "90 %", "determined"]]
-    by_experiment: dict[str, list[Row]] = {}
-    for row in fits.finished:
-        by_experiment.setdefault(row["experiment"], []).append(row)
-    for experiment, members in by_experiment.items():
-        outcomes = [row["outcome"] for row in members if "outcome" in row]
-        for name in dict.fromkeys(name for of in outcomes for name in of["parameters"]):
-            of_name = [of["parameters"][name] for of in outcomes if name in of["parameters"]]
-            values = sorted(fitted["value"] for fitted in of_name if fitted["determined"])
-            figures = [number(q) for q in _quantiles(values)] or ["–"] * 3
-            known = f"{len(values)} of {len(of_name)}"
-            rows.append([experiment, name, of_name[0]["unit"], *figures, known])
+    for (experiment, name), values in _by_parameter(fits.finished).items():
+        known = sorted(fitted["value"] for fitted in values if fitted["determined"])
+        figures = [number(q) for q in _quantiles(known)] or ["–"] * 3
+        count = f"{len(known)} of {len(values)}"
+        rows.append([experiment, name, values[0]["unit"], *figures, count])
     return rows
 
 
@@ -122,13 +111,7 @@ def share_by_error(fits: ManyFits) -> list[str]:
 
 
 def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> Document:
-    """What many fits say.
-
-    Args:
-        fits: all of them.
-        experiments: of which they are.
-        tables: names of the files that have a row for each fit.
-    """
+    """What many fits say; `tables` are the files that have a row for each."""
     title = (
         "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
         "grey where it does not; and how long fits took, on a logarithmic axis"
@@ -143,7 +126,7 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
         kind="Many fits, each in a folder of its own",
         title=listed([experiment.name for experiment in experiments]),
         verdict=_verdict(fits),
-        good=not (fits.failed or fits.unconverged or fits.interrupted or misfits(fits)),
+        good=not (fits.failed or fits.unconverged or fits.interrupted or fits.misfits),
         findings=findings(fits),
         sections=[
             *sections,
@@ -161,23 +144,13 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
 
 @styled
 def overview(fits: ManyFits, title: str) -> Figure:
-    """Of each parameter the values of all fits; and the seconds that they took.
-
-    Args:
-        fits: with at least one that is finished.
-        title: of the figure.
-    """
+    """Of each parameter the values of all fits; and the seconds that they took."""
     series = list(_by_parameter(fits.finished).items())[:SHOWN]
-    rows = -(-(len(series) + 1) // COLUMNS)
-    figure = Figure(figsize=(17, 3.6 * rows + 1.0), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+    figure, grid = panels(len(series) + 1, COLUMNS, title, 3.6, 1.0)
     for axes, ((experiment, name), values) in zip(grid, series, strict=False):
         _values(axes, values)
         axes.set_title(f"{name}\n{experiment}", fontsize=12)
-    _seconds(grid[len(series)], fits.finished)
-    for axes in grid[len(series) + 1 :]:
-        axes.set_axis_off()
+    _seconds(grid[-1], fits.finished)
     return figure
 
 
@@ -247,7 +220,7 @@ def _verdict(fits: ManyFits) -> str:
         return f"{fits.total - len(fits.finished)} are missing"
     if fits.unconverged:
         return f"{len(fits.unconverged)} not converged"
-    bad = misfits(fits)
+    bad = fits.misfits
     return f"All converged, {bad} do{'es' * (bad == 1)} not match" if bad else "All converged"
 
 
@@ -272,19 +245,19 @@ def _completeness(fits: ManyFits) -> Finding:
 
 
 def _convergence(fits: ManyFits) -> Finding:
-    outcomes = [row["outcome"] for row in fits.finished if "outcome" in row]
+    outcomes = fits.outcomes
     if not outcomes:
         return Finding("No fit is finished, so nothing was found.", bad=True)
-    bad = misfits(fits)
+    bad = fits.misfits
     text = f"{len(outcomes) - bad} of {len(outcomes)} match the motion to within the given sigmas"
     if fits.unconverged:
-        runs = listed([row["run"] for row in fits.unconverged])
+        runs = listed(fits.unconverged)
         return Finding(f"{len(fits.unconverged)} did not converge ({runs}); {text}.", bad=True)
     return Finding(f"All finished searches converged; {text}.", bad=bad > 0)
 
 
 def _effort(fits: ManyFits) -> Finding:
-    efforts = [row["effort"] for row in fits.finished if "effort" in row]
+    efforts = fits.efforts
     if not efforts:
         return Finding("Nothing is known of what a fit takes.")
     seconds = statistics.median(effort["seconds"] for effort in efforts)

@@ -18,7 +18,6 @@ import functools
 import hashlib
 import io
 import re
-import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,8 +30,8 @@ from fitting.runtime import files
 from fitting.runtime.cluster import Effort
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.store import Store
+from fitting.studies.campaign import clip_names
 from fitting.studies.fit.fit import Fit, Interval
-from fitting.studies.population.population import clip_names
 
 RUNS = "runs"
 TOGETHER = "all clips"
@@ -81,12 +80,7 @@ class FitTask:
 def plan(
     experiments: Sequence[Experiment], seeds: int = 1, *, together: bool = False
 ) -> list[FitTask]:
-    """All fits, in the order of experiments, clips and seeds.
-
-    Args:
-        experiments: each with one clip or more.
-        seeds: fits of each clip, with the experiment's seed and those that follow it.
-        together: whether the clips of an experiment are fitted together, as `jaxik fit` does.
+    """All fits, in the order of experiments, clips and seeds; arguments as of `fit_many`.
 
     Raises:
         ValueError: there is no experiment, or not one seed; a capture of one of several clips is
@@ -222,6 +216,15 @@ ROW_FILE = JsonFile(
 def outcome_of(fitted: Fit) -> Outcome:
     """What a finished fit found."""
     summary = fitted.summary
+    parameters: dict[str, FittedValue] = {
+        row["name"]: {
+            "value": row["value"],
+            "unit": row["unit"],
+            "interval": row["interval"],
+            "determined": row["determined"],
+        }
+        for row in summary["parameters"]
+    }
     return {
         "converged": summary["converged"],
         "fits": summary["goodness"]["fits"],
@@ -233,28 +236,22 @@ def outcome_of(fitted: Fit) -> Outcome:
         "steps": summary["steps"],
         "search_seconds": summary["seconds"],
         "frames": sum(scene.frames.dt.shape[0] for scene in fitted.problem.data),
-        "parameters": {
-            row["name"]: {
-                "value": row["value"],
-                "unit": row["unit"],
-                "interval": row["interval"],
-                "determined": row["determined"],
-            }
-            for row in summary["parameters"]
-        },
+        "parameters": parameters,
     }
 
 
-def finished_row(task: FitTask, outcome: Outcome, effort: Effort, notes: list[str]) -> Row:
-    """The row of a fit that is whole."""
-    row = _row(task, "finished", "")
-    row["notes"], row["outcome"], row["effort"] = notes, outcome, effort
-    return row
-
-
-def failed_row(task: FitTask, error: str) -> Row:
-    """The row of a fit that could not be made."""
-    return _row(task, "failed", error)
+def make_row(task: FitTask, error: str = "") -> Row:
+    """The row of a fit that could not be made, or of one that is whole but for what it found."""
+    return {
+        "experiment": task.name,
+        "clip": task.clip,
+        "seed": task.experiment.seed,
+        "run": task.run.as_posix(),
+        "state": "failed" if error else "finished",
+        "error": error,
+        "identity": task.identity(),
+        "notes": [],
+    }
 
 
 def read_row(folder: Path, task: FitTask) -> Row | None:
@@ -266,31 +263,14 @@ def read_row(folder: Path, task: FitTask) -> Row | None:
     name = f"{task.run / ROW}"
     if not (folder / name).is_file():
         return None  # without the identity, which takes reading all of the clips
-    return _store(folder).read(name, {"identity": task.identity()})
+    return row_store(folder).read(name, {"identity": task.identity()})
 
 
-def write_row(folder: Path, row: Row) -> None:
-    """Says that a run is whole."""
-    _store(folder).write(f"{row['run']}/{ROW}", row)
-
-
-def _store(folder: Path) -> Store[Row]:
+def row_store(folder: Path) -> Store[Row]:
+    """The rows in the folder of all fits."""
     return Store(
         ROW_FILE, folder, "has the fit of another experiment, or of one that has changed since"
     )
-
-
-def _row(task: FitTask, state: Literal["finished", "failed"], error: str) -> Row:
-    return {
-        "experiment": task.name,
-        "clip": task.clip,
-        "seed": task.experiment.seed,
-        "run": task.run.as_posix(),
-        "state": state,
-        "error": error,
-        "identity": task.identity(),
-        "notes": [],
-    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,52 +298,24 @@ class ManyFits:
         return [row for row in self.rows if row["state"] == "failed"]
 
     @property
-    def unconverged(self) -> list[Row]:
-        """The rows of finished fits whose search has not converged."""
-        return [
-            row for row in self.finished if "outcome" in row and not row["outcome"]["converged"]
-        ]
-
-
-class Tally:
-    """The rows of many fits: those of earlier calls, and new ones as they end."""
-
-    def __init__(self, folder: Path, tasks: Sequence[FitTask]) -> None:
-        """Looks for finished fits.
-
-        Raises:
-            ValueError: the folder has the fit of an experiment that was changed since.
-        """
-        self.folder, self.tasks = folder, tasks
-        rows = [read_row(folder, task) for task in tasks]
-        self.missing = [task for task, row in zip(tasks, rows, strict=True) if row is None]
-        """The fits that are to be made."""
-        runs = [task.run.as_posix() for task in tasks]
-        self._rows = dict(zip(runs, rows, strict=True))
-        self._began = time.monotonic()
-        self._made = self.failed = 0
-
-    def add(self, row: Row) -> None:
-        """Takes the row of a fit that was missing."""
-        self._rows[row["run"]] = row
-        self._made += 1
-        self.failed += row["state"] == "failed"
-
-    def look_again(self) -> None:
-        """Takes the rows that were written and not yet told of, as an interrupt came between."""
-        for task in self.missing:
-            if self._rows[task.run.as_posix()] is None and (row := read_row(self.folder, task)):
-                self.add(row)
-
-    def fits(self, *, interrupted: bool) -> ManyFits:
-        """All rows there are, in the order of the tasks."""
-        rows = tuple(row for row in self._rows.values() if row is not None)
-        total = len(self.tasks)
-        return ManyFits(rows, total, self.folder, self._elapsed, self._made, interrupted)
+    def outcomes(self) -> dict[str, Outcome]:
+        """What finished fits found, by run."""
+        return {row["run"]: row["outcome"] for row in self.rows if "outcome" in row}
 
     @property
-    def _elapsed(self) -> float:
-        return time.monotonic() - self._began
+    def efforts(self) -> list[Effort]:
+        """What finished fits took."""
+        return [row["effort"] for row in self.rows if "effort" in row]
+
+    @property
+    def unconverged(self) -> list[str]:
+        """The runs of finished fits whose search has not converged."""
+        return [run for run, outcome in self.outcomes.items() if not outcome["converged"]]
+
+    @property
+    def misfits(self) -> int:
+        """How many finished fits leave more of the motion over than noise of the given sigmas."""
+        return sum(not outcome["fits"] for outcome in self.outcomes.values())
 
 
 def columns(rows: Sequence[Row]) -> list[str]:

@@ -11,11 +11,9 @@ another name.
 """
 
 import dataclasses
-import functools
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NotRequired, TypedDict
+from typing import Annotated, NamedTuple, NotRequired, TypedDict
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxik
-from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.experiment import Experiment
 from fitting.inference.mixed_model import (
     Draws,
     Grouping,
@@ -44,6 +42,7 @@ from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
+from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit.assess import search_identity, search_with_noise
 from jaxik.maths import parameter_tree
 
@@ -72,64 +71,66 @@ FOUND_FILE = JsonFile(
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Searches:
-    """Searches with the settings of an experiment."""
+class SearchTask(NamedTuple):
+    """A search with the settings of an experiment."""
 
+    name: str
+    """Of what is fitted, for the reader."""
+    problem: Problem[jaxik.FootIK]
     experiment: Experiment
-    folder: Path | None
-    """Where they are stored; None stores none."""
+    key: str
+    """Of everything that its result follows from."""
 
-    def fit(
-        self, name: str, problem: Problem[jaxik.FootIK], *, with_its_noise: bool = False
-    ) -> tuple[Problem[jaxik.FootIK], Found]:
-        """The best fit, and the problem with the noise that was found.
 
-        Args:
-            name: of what is fitted, for the reader.
-            problem: what to fit.
-            with_its_noise: whether the noise that the experiment estimates is estimated here.
+def _task(name: str, problem: Problem[jaxik.FootIK], experiment: Experiment) -> SearchTask:
+    return SearchTask(name, problem, experiment, search_identity(problem, experiment)[:16])
 
-        Raises:
-            KeyboardInterrupt: the search was interrupted; it goes on when it is called again.
-            ValueError: a file in the folder is something else.
-        """
-        experiment = self.experiment
-        if not with_its_noise:
-            experiment = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
-        key = search_identity(problem, experiment)[:16]
-        folder = None if self.folder is None else self.folder / SEARCHES
-        search = functools.partial(self._search, name, problem, experiment)
-        with Checkpoints(folder, f"{key}.part", key) as checkpoints:
-            found = search_store(folder, problem.space.size).remember(f"{key}.json", search)
-        checkpoints.remove()
-        if "noise" in found:
-            problem = with_noise(problem, NoiseModel(**found["noise"]))
-        return problem, found
 
-    def _search(
-        self,
-        name: str,
-        problem: Problem[jaxik.FootIK],
-        experiment: Experiment,
-    ) -> Found:
-        with activity.announced(f"Fitting {name}"):
-            fitted, solution = search_with_noise(problem, experiment)
-        if solution.interrupted:
-            raise KeyboardInterrupt
-        found: Found = {
-            "name": name,
-            "u": solution.u.tolist(),
-            "cost": solution.cost,
-            "converged": solution.converged,
-            "message": solution.message,
-            "seconds": solution.seconds,
-        }
-        if experiment.noise.estimates_any:
-            found["noise"] = dataclasses.asdict(noise_of(fitted))
-        activity.report(found)
-        activity.log(found_line(found))
+def _search_all(title: str, tasks: Sequence[SearchTask], folder: Path | None) -> list[Found]:
+    """The results of searches, those that are stored and new ones, which are stored.
+
+    Raises:
+        KeyboardInterrupt: a search was interrupted; it goes on when it is called again.
+        ValueError: a file in the folder is something else.
+    """
+    folder = None if folder is None else folder / SEARCHES
+    store = search_store(folder, tasks[0].problem.space.size)
+
+    def checkpoints(task: SearchTask) -> Checkpoints:
+        return Checkpoints(folder, f"{task.key}.part", task.key)
+
+    def search(task: SearchTask) -> Found:
+        with checkpoints(task):
+            return _search(task)
+
+    def read(task: SearchTask) -> Found | None:
+        if (found := store.read(f"{task.key}.json")) is not None:
+            checkpoints(task).remove()
         return found
+
+    def write(task: SearchTask, found: Found) -> None:
+        store.write(f"{task.key}.json", found)
+        checkpoints(task).remove()
+
+    return Campaign(title, tasks, search, read, write, found_line, lambda task: task.name).run()
+
+
+def _search(task: SearchTask) -> Found:
+    with activity.announced(f"Fitting {task.name}"):
+        fitted, solution = search_with_noise(task.problem, task.experiment)
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    found: Found = {
+        "name": task.name,
+        "u": solution.u.tolist(),
+        "cost": solution.cost,
+        "converged": solution.converged,
+        "message": solution.message,
+        "seconds": solution.seconds,
+    }
+    if task.experiment.noise.estimates_any:
+        found["noise"] = dataclasses.asdict(noise_of(fitted))
+    return found
 
 
 def found_line(found: Found) -> str:
@@ -189,12 +190,8 @@ def summarise(
 ) -> list[ParameterEstimates]:
     """The estimates of all parameters, in the order of `u`.
 
-    Args:
-        problems: of one clip each.
-        alone: the best fit of each clip, in u.
-        pooled: that of all clips together.
-        fit: of the population.
-        levels: at which each parameter varies.
+    Problems are of one clip each; `alone` and `pooled` are best fits, in u; `levels` says at which
+    each parameter varies.
     """
     space = problems[0].space
     of_clips = [_laplace([problem], u[None]) for problem, u in zip(problems, alone, strict=True)]
@@ -302,12 +299,8 @@ def predict(
 ) -> Float[np.ndarray, " free"]:
     """The parameters of a clip, in u, as the population of the others expects them.
 
-    Args:
-        problems: of one clip each.
-        grouping: of all clips.
-        fit: of all clips, where the search begins.
-        pooled: the best fit of all clips but this one, where it begins too; in u.
-        clip: the one that is left out.
+    The search begins at `fit`, of all clips, and at `pooled`, the best fit of all but this one, in
+    u.
     """
     rest = [problem for c, problem in enumerate(problems) if c != clip]
     starts = [np.tile(pooled, (len(rest), 1)), np.delete(fit.clips, clip, axis=0)]
@@ -387,20 +380,6 @@ class Population:
         }
 
 
-def clip_names(entries: Sequence[ClipEntry]) -> tuple[str, ...]:
-    """A name for each clip: that of its file, and where a file has several, which part of it."""
-    stems = [entry.reference.stem for entry in entries]
-    counts = Counter(stems)
-    names = [
-        f"{stem} from {entry.start:g} s" if counts[stem] > 1 else stem
-        for stem, entry in zip(stems, entries, strict=True)
-    ]
-    counts = Counter(names)
-    return tuple(
-        f"{name} ({number})" if counts[name] > 1 else name for number, name in enumerate(names, 1)
-    )
-
-
 @in_float64
 def fit_clips_and_population(
     experiment: Experiment,
@@ -411,11 +390,6 @@ def fit_clips_and_population(
 
     Noise that the experiment estimates is estimated in each clip alone, where no difference between
     clips counts as noise, and is taken from there.
-
-    Args:
-        experiment: with parameters that vary between clips or subjects.
-        problem: of the experiment.
-        folder: where finished searches are kept; what it has is not repeated. None keeps none.
 
     Raises:
         KeyboardInterrupt: it was interrupted; finished searches are in the folder.
@@ -432,23 +406,25 @@ def fit_clips_and_population(
     )
     grouping = experiment.hierarchy.grouping(names, clips, subjects)
     check_thresholds(problem.space, grouping)
-    searches = Searches(experiment, folder)
-    problems, alone = [], []
-    for name, scene in zip(clips, problem.data, strict=True):
-        single = eqx.tree_at(lambda p: p.data, problem, (scene,))
-        single, found = searches.fit(name, single, with_its_noise=True)
-        problems.append(single)
-        alone.append(found)
-    pooled_problem = _joined(problem, problems)
-    _, pooled = searches.fit(EVERYTHING, pooled_problem)
+    singles = [eqx.tree_at(lambda p: p.data, problem, (scene,)) for scene in problem.data]
+    tasks = [_task(*pair, experiment) for pair in zip(clips, singles, strict=True)]
+    alone = _search_all(f"Fitting {len(clips)} clips, each alone", tasks, folder)
+    problems = [
+        with_noise(single, NoiseModel(**found["noise"])) if "noise" in found else single
+        for single, found in zip(singles, alone, strict=True)
+    ]
+    whole = _joined(problem, problems)
+    known = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
+    rests = [f"{EVERYTHING} but {name}" for name in clips]
+    tasks = [_task(EVERYTHING, whole, known)]
+    tasks += [_task(rest, without_clip(whole, c), known) for c, rest in enumerate(rests)]
+    pooled, *others = _search_all("Fitting all clips, and all but each", tasks, folder)
     alone_u, pooled_u = np.array([found["u"] for found in alone]), np.array(pooled["u"])
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     with activity.announced("Fitting the population"):
         fit = fit_population(problems, grouping, starts)
-    errors, others = [], []
+    errors = []
     for c, name in enumerate(clips):
-        rest = f"{EVERYTHING} but {name}"
-        others.append(searches.fit(rest, without_clip(pooled_problem, c))[1])
         others_u = np.array(others[c]["u"])
         with activity.announced(f"Predicting {name} from the others"):
             expected = predict(problems, grouping, fit, others_u, c)

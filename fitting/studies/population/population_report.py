@@ -20,7 +20,7 @@ from fitting.experiment.systems import Preset
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, interval, number
-from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, styled
+from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import run_folder
@@ -181,19 +181,15 @@ def overview(population: Population, title: str) -> Figure:
     varying = [row for row in population.parameters if row["spread"] is not None]
     labels = [clip_label(population, c) for c in range(len(population.clips))]
     columns = min(PANELS_PER_ROW, len(varying) + 1)
-    rows = -(-(len(varying) + 1) // columns)
-    height = rows * (0.45 * len(labels) + 1.6) + 1.6
-    figure = Figure(figsize=(5.6 * columns, height), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for axes, row in zip(grid.flat, varying, strict=False):
+    height, width = 0.45 * len(labels) + 1.6, 5.6 * columns
+    count = len(varying) + 1
+    figure, grid = panels(count, columns, title, height, 1.6, width=width, sharey=True)
+    for axes, row in zip(grid, varying, strict=False):
         _estimates(axes, row)
-    _errors(grid.flat[len(varying)], population)
-    for axes in list(grid.flat)[len(varying) + 1 :]:
-        axes.set_axis_off()
-    for axes in grid[:, 0]:
+    _errors(grid[-1], population)
+    for axes in grid[::columns]:
         axes.set_yticks(range(len(labels)), labels)
-    grid[0, 0].set_ylim(len(labels) - 0.4, -0.6)
+    grid[0].set_ylim(len(labels) - 0.4, -0.6)
     legend(
         figure,
         Line2D([], [], marker="o", color=BEFORE, label="fitted alone, 95 %"),
