@@ -38,6 +38,6 @@ from .studies.animations import AnimationFiles as AnimationFiles
 from .studies.fit.fit import Fit as Fit
 from .studies.many.evaluation import evaluate_many as evaluate_many
 from .studies.many.evaluation import vary as vary
-from .studies.many.many_tasks import ManyFits as ManyFits
+from .studies.many.fit_many import ManyFits as ManyFits
 from .studies.translation import TranslationRequest as TranslationRequest
 from .studies.translation import load_named_system as load_named_system

@@ -24,7 +24,7 @@ from .studies.fit.fit_jobs import fit as fit
 from .studies.fit.fit_jobs import sample as sample
 from .studies.fit.fit_jobs import translate as translate
 from .studies.many.fit_many import fit_many as fit_many
-from .studies.population.population_report import population as population
+from .studies.population.population import population as population
 from .studies.sample.run_comparison import compare_runs as compare_runs
 from .viewer.views import view as view
 from .viewer.views import view_run as view_run

@@ -31,7 +31,6 @@ from .workloads import Sizes
 Vectors = Float[np.ndarray, "legs 3"]
 Rotations = Float[np.ndarray, "legs 4"]
 
-
 BLOCK = 256  # legs at once on a CPU: they fit a core's cache, and XLA makes their loop one kernel
 
 

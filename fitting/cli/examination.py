@@ -26,10 +26,8 @@ from .terminal import show
 LONGEST = 300.0  # s, for what needs JAX; it takes half a minute on two slow cores
 WITH_JAX = "fitting.cli.with_jax"
 
-
 PACKAGES = ("jaxik", "fitting")
 FOR_DEVELOPERS = {"test", "dev", "docs", "mutation"}  # extras that no command needs
-
 
 CPU, MEMORY = Path("/proc/cpuinfo"), Path("/proc/meminfo")  # on Linux
 NEEDED_GB = 1.0  # the self-test, which fits one parameter to 12 s of motion, takes 0.6

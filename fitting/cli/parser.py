@@ -48,7 +48,6 @@ far, `sample` its chain, `ablate`, `calibrate`, `fit-many` and `population` each
 `jaxik COMMAND --help` has more examples.
 """
 
-
 COMMANDS = (
     fits.init, fits.fit, fits.ablate, fits.calibrate, fits.population, fits.fit_many, fits.sample,
     animations.apply, animations.run, animations.view, animations.compare, fits.translate,

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fitting.studies.fit.fit import Fit
-    from fitting.studies.many.many_tasks import ManyFits
+    from fitting.studies.many.fit_many import ManyFits
 
 PROBLEMS_FOUND = 1  # by `doctor`
 NOT_CONVERGED = 3  # the search of a fit

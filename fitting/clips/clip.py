@@ -28,7 +28,6 @@ TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields wi
 INCH = 0.0254  # m
 Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
-
 FURTHEST = 1e6  # m, of any joint from the origin
 SHORTEST, LONGEST = 1e-4, 100.0  # m, of a bone of a leg
 SLOWEST, FASTEST = 1e-3, 1e5  # frames per second

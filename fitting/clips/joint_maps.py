@@ -59,7 +59,6 @@ DIALECTS = {
 MECHANISM = ("org", "mch")  # prefixes of Rigify's copies of a skeleton, which do not deform it
 LegJoints = tuple[int, int, int, int | None]  # hip, knee, ankle and toe
 
-
 ROLE = re.compile(r"pelvis|(hip|knee|ankle|toe)_.+")
 NAME = validation.Constraint("the name of a joint", validation.TEXT.accepts)
 ADVICE = (

@@ -55,7 +55,6 @@ MAX_CELLS = 2_000_000  # of a mesh
 CHUNK = 10_000  # cells whose heights are found at a time; bounds the memory
 SMOOTHING = 10.0 ** np.arange(-6.0, 2.1, 0.5)  # m², candidates for a thin plate
 
-
 # A foot is on its toes where it is pitched down more than usual: by 5 degrees, and by three
 # standard deviations (estimated from the median absolute deviation), as slopes make pitch vary.
 TOE_PITCH, TOE_DEVIATIONS = np.radians(5.0), 3.0 * 1.4826

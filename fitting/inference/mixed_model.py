@@ -40,7 +40,6 @@ from .optimise.levenberg_marquardt import HardModel
 
 SHARED = -1  # the group of every clip, for a parameter that all clips have in common
 
-
 GRID = np.linspace(0.0, 1.0, 401) ** 2  # of the widest spread: where a density is computed
 WIDEST = 4.0  # scales of the half-normal prior, where the grid ends
 MAX_SWEEPS = 200  # over the spreads, each maximised for the others
@@ -49,7 +48,6 @@ BLOCK = 200  # draws computed at once
 BURN_IN = 50  # draws of the spreads that are dropped
 
 Spreads = Float[np.ndarray, " parameters"]
-
 
 MAX_ROUNDS = 60
 SMALL_STEP = 0.01  # of a parameter's standard deviation: nothing moves by more at the end

@@ -47,18 +47,14 @@ TAIL_RANGE = (1.5, 100.0)  # degrees of freedom; from 100 on, Student's t is nea
 ITERATIONS = 100  # of the reweighting, at most
 TOLERANCE = 1e-8  # relative change of a variance that ends it
 
-
 STEP = 1e-4  # sigmas, over which the slope of a residual's influence is taken
 LEAST_SLOPE = 0.05  # on average; under Cauchy's loss that of far outliers is negative
-
 
 FARTHEST = 20.0  # inverse hyperbolic sine of the residual, in sigmas, at which the tails end
 POINTS = 8001
 
-
 DRAWS = 1024  # of each sigma, at most
 BATCH = 64  # of them at a time
-
 
 MAX_ROUNDS = 20
 JOINT_TOLERANCE = (

@@ -42,7 +42,6 @@ FreeTable = Mapping[str, Mapping[str, float | int | str]]  # names, and override
 
 INDEPENDENT_EVERY = 0.5  # s between residuals of captured motion that tell something new
 
-
 MOST = 4  # parameters that are changed
 AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
 

@@ -46,12 +46,10 @@ MEDIAN = float(special.ndtri(0.75))  # median size of a standard normal
 MEDIAN_EFFICIENCY = 0.3675  # of the median of sizes as an estimate of scale (Huber 1981, 5.1)
 LARGEST = 3.0  # sigmas; beyond it a residual is taken as this large where outliers are expected
 
-
 NEAR, FAR = 3.0, 5.0  # sigmas beyond which residuals are counted
 MANY_OUTLIERS = 0.005  # fraction beyond FAR; a normal has 6e-7, noise of Student's t with 4.4 this
 LONGEST_OUTLIER = 3  # frames; what is far off for longer is a misfit
 MIN_SEEN = 0.5  # fraction of a stretch that must have been observed
-
 
 SIGNIFICANT = 1e-3  # p-value, over all groups, above which nothing is a finding
 TOO_LARGE = 1.25  # noise over the sigma that was given; likewise its inverse

@@ -23,7 +23,6 @@ GROUND = ("ground_height", "ground_tilt_x", "ground_tilt_z")
 SHIFT = "time_shift"
 SPREAD = 0.55  # of u: 95 % of such a prior are within half the reach, 2 standard deviations
 
-
 MEASURED = ("ankle", "knee", "pelvis", "foot", "body")  # kinds that have a noise of their own
 WHITENED = (*MEASURED, "contact")  # kinds whose residuals have a correlation from frame to frame
 # No capture is known better than this: 1 mm, and 0.1 degrees.

@@ -51,14 +51,12 @@ LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 OVERRIDES = ("low", "high", "kind", "scale")
 
-
 Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
 Shape = Literal["normal", "uniform"]
 
 SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
 SPREADS = (1e-3, 1e3)  # of u: from almost known to almost all at the bounds
 LOGISTIC_SD = math.pi / math.sqrt(3)  # of the logistic distribution
-
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
 CENTRE_LIMIT = 3.0  # of u, for given centres and for starts: at a bound u is infinite
@@ -70,7 +68,6 @@ DRAWS = 20_000  # from the prior, for the interval of a parameter that depends o
 System = TypeVar("System", bound=eqx.Module)
 Vector: TypeAlias = Float[Array | np.ndarray, " free"]
 Rows = TypeVar("Rows", bound=Float[Array | np.ndarray, "*rows free"])
-
 
 MIXTURE = 200  # draws of the others, where a parameter stays above another free one
 

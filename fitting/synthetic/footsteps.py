@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 WAVELENGTHS = (9.0, 5.3)  # m, of a path's bends
 
-
 SIDES = (1.0, -1.0)  # left, right
 HALF_TRACK = 0.08  # m from the path to a foot
 ALONG_SD, ASIDE_SD, LIFT_SD = 0.015, 0.008, 0.01  # m, of footholds and of the height of swings

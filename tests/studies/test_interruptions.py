@@ -20,8 +20,8 @@ from fitting.studies import ablation
 from fitting.studies.calibrate import replicates
 from fitting.studies.fit import assess, fit_jobs, run_folder
 from fitting.studies.fit.fit import Fit
-from fitting.studies.many import many_tasks
-from fitting.studies.many.many_tasks import plan
+from fitting.studies.many import fit_many
+from fitting.studies.many.fit_many import plan
 from fitting.studies.population import population
 from support import runs, small_studies
 from support.experiments import ROOT, write
@@ -213,7 +213,7 @@ def test_one_ctrl_c_ends_a_command_with_workers_and_the_same_command_goes_on(tmp
     _, second = plan([load_experiment(experiment)])
 
     def whole() -> dict[Path, bytes]:
-        return {path: path.read_bytes() for path in out.glob(f"runs/**/{many_tasks.ROW}")}
+        return {path: path.read_bytes() for path in out.glob(f"runs/**/{fit_many.ROW}")}
 
     with (
         claimed((out / second.run).with_suffix(".lock")),  # so that it cannot end meanwhile
@@ -234,7 +234,7 @@ def test_one_ctrl_c_ends_a_command_with_workers_and_the_same_command_goes_on(tmp
     text, before = screen.read_text(), whole()
     assert "Finished: 1 of 2 fits" in text and "Traceback" not in text
     assert "the same command makes the fit that is missing" in text
-    assert len((out / many_tasks.CSV).read_text().splitlines()) == 1 + len(before) == 2
+    assert len((out / fit_many.CSV).read_text().splitlines()) == 1 + len(before) == 2
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
     assert done.returncode in (0, 3), done.stderr
     assert "1 are there already" in done.stdout and "http://127.0.0.1:" in done.stdout

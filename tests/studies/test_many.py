@@ -27,9 +27,9 @@ from fitting.runtime import cluster
 from fitting.runtime.claimed_folder import claimed
 from fitting.studies.campaign import Campaign
 from fitting.studies.fit import run_folder
-from fitting.studies.many import evaluation, many_tasks
-from fitting.studies.many import fit_many as task_of_worker
-from fitting.studies.many.many_tasks import plan
+from fitting.studies.many import evaluation
+from fitting.studies.many import fit_many as many_fits
+from fitting.studies.many.fit_many import plan
 from jaxik.maths import parameter_tree
 from jaxik.world import similarity
 from support import scenes, small_studies
@@ -67,7 +67,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
-    return [many_tasks.cells(row) for row in fits.rows]
+    return [many_fits.cells(row) for row in fits.rows]
 
 
 # What is fitted
@@ -103,7 +103,7 @@ def test_a_fit_is_another_one_if_its_experiment_or_a_file_of_it_changes(experime
 
 
 def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_file, monkeypatch):
-    for kept in list(out.glob(f"runs/**/{many_tasks.ROW}"))[1:]:
+    for kept in list(out.glob(f"runs/**/{many_fits.ROW}"))[1:]:
         kept.unlink()
 
     def interrupted(self, client):
@@ -127,10 +127,10 @@ def test_each_fit_is_a_run_and_a_row(finished):
         experiment, summary = run_folder.load_fit(finished.folder / row["run"])
         assert len(experiment.clips) == 1 and experiment.seed == row["seed"]
         assert "outcome" in row and summary["cost"] == row["outcome"]["cost"]
-    present = read(finished.folder / many_tasks.CSV)
+    present = read(finished.folder / many_fits.CSV)
     assert [row["run"] for row in present] == [row["run"] for row in finished.rows]
     assert float(present[0]["pelvis.on_gain"]) == pytest.approx(0.3, abs=0.02)
-    parquet = pyarrow.parquet.read_table(finished.folder / many_tasks.PARQUET).to_pylist()
+    parquet = pyarrow.parquet.read_table(finished.folder / many_fits.PARQUET).to_pylist()
     assert [row["cost"] for row in parquet] == [row["cost"] for row in cells(finished)]
     files = {path.name for path in finished.folder.iterdir()}
     assert {"fits.png", "summary.md", "report.html"} <= files
@@ -138,18 +138,18 @@ def test_each_fit_is_a_run_and_a_row(finished):
 
 def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, monkeypatch):
     lines: list[str] = []
-    (out / finished.rows[0]["run"] / many_tasks.ROW).unlink()
+    (out / finished.rows[0]["run"] / many_fits.ROW).unlink()
     with listening(lines.append):
         assert fit_many(experiment_file, out, seeds=2).made == 1
     assert "4 fits of 1 experiment, 2 seeds for each clip; 3 are there already" in lines
-    monkeypatch.setattr(task_of_worker, "fit", None)
+    monkeypatch.setattr(many_fits, "fit", None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (out / many_tasks.PARQUET).unlink()
+    (out / many_fits.PARQUET).unlink()
     with listening(lines.append):
         again = fit_many(experiment_file, out, seeds=2)
     assert again.rows[1:] == finished.rows[1:] and again.made == 0
     assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
-    assert (out / many_tasks.CSV).is_file() and not (out / many_tasks.PARQUET).exists()
+    assert (out / many_fits.CSV).is_file() and not (out / many_fits.PARQUET).exists()
 
 
 def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
@@ -179,7 +179,7 @@ def test_the_run_of_another_experiment_is_not_taken_for_ones_own(out, experiment
 def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
     experiment_file, tmp_path, monkeypatch, undrawn
 ):
-    out, real = tmp_path / "out", task_of_worker.fit
+    out, real = tmp_path / "out", many_fits.fit
 
     def fails_first(experiment, *args, **named):
         if experiment.clips[0].start == 1.0:
@@ -187,13 +187,13 @@ def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
         return real(experiment, *args, **named)
 
     with monkeypatch.context() as patch:
-        patch.setattr(task_of_worker, "fit", fails_first)
+        patch.setattr(many_fits, "fit", fails_first)
         words = ["fit-many", str(experiment_file), "-o", str(out), "--workers", "0"]
         assert main.main([*words, "--no-reports"]) == 6
-    first, second = read(out / many_tasks.CSV)
+    first, second = read(out / many_fits.CSV)
     assert (first["state"], first["error"]) == ("failed", "no luck") and not first["cost"]
     assert second["state"] == "finished" and second["cost"]
-    trace = out / first["run"] / task_of_worker.ERROR
+    trace = out / first["run"] / many_fits.ERROR
     assert "RuntimeError: no\nluck" in trace.read_text()
     assert "no luck" in (out / "report.html").read_text()
     assert not fit_many(experiment_file, out).failed

@@ -18,7 +18,7 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import NoiseOptions
 from fitting.report import document, pages
 from fitting.studies.campaign import clip_names
-from fitting.studies.population import population, population_report
+from fitting.studies.population import population
 from fitting.studies.population.population import Population
 from jaxik.maths import parameter_tree
 from support import small_studies
@@ -188,12 +188,12 @@ def test_the_summary_says_whether_clips_differ_as_far_as_that_is_known(fitted):
         ),
     ):
         changed = dataclasses.replace(fitted, parameters=[{**gain, "spread": spread}, pitch])
-        brief = document.text(population_report.document(changed))
+        brief = document.text(population.document(changed))
         assert text in brief.rpartition("\n\n- ")[2]
 
 
 def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
-    table = population_report.parameter_table(fitted)
+    table = population.parameter_table(fitted)
     assert [row[1] for row in table[1:7]] == [
         "uneven_walk from 0 s (ann)", "uneven_walk from 1 s (ann)", "uneven_walk from 2 s (ben)",
         "pooled", "population", "spread, of u",
@@ -201,10 +201,10 @@ def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
     assert table[1][0] == "`pelvis.on_gain`, 1/tick, per clip" and table[7][1] == "95 % of clips"
     assert table[8][0] == "`foot.max_pitch`, rad, shared" and len(table) == 13
     assert table[8][3] == "" != table[12][3]
-    errors = population_report.error_table(fitted)
+    errors = population.error_table(fitted)
     assert len(errors) == 5 and errors[-1][0] == "all"
     squares = [row.alone**2 for row in fitted.errors]
     assert errors[-1][1] == f"{100 * np.sqrt(np.mean(squares)):.2f}"
-    figure = population_report.overview(fitted, "title")
+    figure = population.overview(fitted, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles == ["pelvis.on_gain", "Error"]

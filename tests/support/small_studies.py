@@ -13,7 +13,7 @@ from fitting.experiment import problems
 from fitting.studies import ablation
 from fitting.studies.animations import Animation
 from fitting.studies.calibrate import replicates
-from fitting.studies.population import population, population_report
+from fitting.studies.population import population
 from jaxik.maths import parameter_tree
 
 from . import quick
@@ -135,9 +135,7 @@ def quick_population(
     """A population whose clips are two numbers each."""
     make = problems.make_problem
     patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_references)
-    patch.setattr(
-        population_report, "make_problem", lambda e: quick.with_measured(make(e), measured)
-    )
+    patch.setattr(population, "make_problem", lambda e: quick.with_measured(make(e), measured))
     patch.setattr(population, "error_at", error_at)
     return write_population(folder, rest)
 

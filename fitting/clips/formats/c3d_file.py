@@ -27,7 +27,6 @@ TEXT, FLOAT = -1, 4
 WIDTHS = {TEXT: 1, 1: 1, 2: 2, FLOAT: 4}  # bytes of a value, by the type of a parameter
 MOST_DIMENSIONS = 7
 
-
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 AXES = {
     f"{sign}{letter}": (1.0 if sign != "-" else -1.0) * np.eye(3)[axis]

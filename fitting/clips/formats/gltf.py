@@ -31,7 +31,6 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 COMPONENT_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 LARGEST_COUNT = 2**53
 
-
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 ON_KEY = 1e-5  # s; times that are given with 32 bits are no more exact
 LATEST = 1e6  # s
@@ -42,7 +41,6 @@ OFF_GRID = 0.02  # of a frame; times of files are often rounded to milliseconds
 
 DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}
 FLAT = 1e-6  # of a length; axes that are less apart have no direction of their own
-
 
 SUFFIXES = (".glb", ".gltf")
 PATHS = tuple(WIDTHS)

@@ -20,7 +20,6 @@ from fitting.runtime.program_cache import cached
 
 BLOCK = 128  # rows of a QR decomposition that fit into a core's cache
 
-
 DESCENT: optx.AbstractDescent = optx.DampedNewtonDescent()
 SEARCH: optx.AbstractSearch = optx.ClassicalTrustRegion()
 

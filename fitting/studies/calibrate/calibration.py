@@ -64,7 +64,6 @@ FIT_LEVEL = 0.95  # of the fit's intervals
 IN_VALLEY = 0.98  # of the fits, at least
 NEAR = 0.05  # of its range: a parameter that is so near its truth has come back
 
-
 NUMBERS, SUMMARY = "calibration.json", "summary.md"
 RANKS, RECOVERY = "ranks.png", "recovery.png"
 LISTED = 20  # replicates, at most, where some are named

@@ -78,7 +78,6 @@ from .replicates import (
 
 SPREAD = 0.3  # of u, in which the truth's parameters are drawn around the values of the system
 
-
 LEVEL = 0.95  # of the bounds of shares
 TRUE_VERDICTS = 0.95  # of all, at least
 POSITIONS = "ankle", "knee", "pelvis"
@@ -92,7 +91,6 @@ SWING_SPEED = 0.4  # m/s, of an animated ankle, above which its foot swings
 KNEE_SHARE = 0.5  # of the ankle's deviation in a swing
 
 Series = Float[np.ndarray, "frames ..."]
-
 
 MOTIONS = {
     "animation": "the flat animation",

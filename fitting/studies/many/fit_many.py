@@ -1,51 +1,416 @@
-"""The job that fits clips × experiments × seeds, each in a run folder of its own."""
+"""Fits of clips × experiments × seeds, each in a run folder, with a table of all and a report.
 
+runs/EXPERIMENT/CLIP/seed_0   where a clip is fitted alone
+runs/EXPERIMENT/seed_0        where the clips of an experiment are fitted together
+
+The row of a fit, in its run folder, is the last file that is written there: a folder that has it is
+whole. The table has a row for each, as CSV and, with pyarrow, as Parquet. Parameters of different
+experiments share it: what a fit has not is empty.
+"""
+
+import csv
+import dataclasses
 import functools
+import hashlib
+import io
+import re
+import statistics
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypeAlias, TypedDict
 
-from fitting.experiment.experiment import Experiment
-from fitting.experiment.experiment_files import load_experiment
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+from fitting.experiment import file_tables
+from fitting.experiment.experiment import ClipEntry, Experiment
+from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
 from fitting.experiment.in_memory import with_files
+from fitting.report import pages
+from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
+from fitting.report.formatting import Table, number, percent
+from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.runtime import activity, cluster, files
-from fitting.runtime.cluster import Stopwatch, first_alone, waiting_for
+from fitting.runtime.cluster import Effort, Stopwatch, first_alone, waiting_for
+from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.plain_tree import NotPlainError
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import program_key
+from fitting.runtime.store import Store
 from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
-from fitting.studies.campaign import Campaign
+from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
-from fitting.studies.fit.fit import Fit
+from fitting.studies.fit.fit import Fit, Interval
 from fitting.studies.fit.fit_jobs import Loaded, fit
+from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
-
-from . import many_report, many_tasks
-from .many_tasks import (
-    ROW,
-    RUNS,
-    FitTask,
-    ManyFits,
-    Row,
-    make_row,
-    outcome_of,
-    plan,
-    read_row,
-    row_store,
-)
 
 if TYPE_CHECKING:
     from distributed import Client
 
 
+RUNS = "runs"
+TOGETHER = "all clips"
+MAX_SEEDS = 10_000
+
+ROW = "row.json"
+
+CSV, PARQUET = "fits.csv", "fits.parquet"
+MISSING = f"no {PARQUET}, as pyarrow is not installed: pip install 'jaxik[parquet]'"
+Cells: TypeAlias = dict[str, Any]  # by column
+OUTCOME = (
+    "converged", "fits", "verdict", "cost_before", "cost", "starts", "agreeing", "steps",
+    "search_seconds", "frames",
+)  # fmt: skip
+EFFORT = ("seconds", "waited", "cpu_seconds", "peak_mb", "host", "process")
+WHAT = ("experiment", "clip", "seed", "run", "state", "error")
+
 INPUTS = "inputs"  # folder of what experiments have in memory
 
 ERROR = "error.txt"
+
+SUMMARY, FIGURE = "summary.md", "fits.png"
+MANY = 50  # rows of a table for people; all are in the file
+SPREAD = (
+    "Of each parameter: the median of the fitted values of all fits that determine it, where 80 % "
+    "of them lie, and how many fits determine it."
+)
+
+COLUMNS = 4
+SHOWN = 15  # parameters
+SHORTEST = 1e-3  # s, of a fit as the histogram shows it
+SINGLE = 150  # fits, up to which each has its interval
+
+LIMITS = [
+    "Each clip is fitted as if there were no others: that values differ does not say that people "
+    "do. `jaxik population` tells spread from uncertainty.",
+    "Fits of one clip with several seeds differ by their search only.",
+]
+TABLES = {"fits.csv": "a row for each fit", "fits.parquet": "the same for pandas and the like"}
+
+
+@dataclasses.dataclass(frozen=True)
+class FitTask:
+    """One fit."""
+
+    experiment: Experiment
+    """As it is fitted: with its own clips and seed."""
+    name: str
+    """Of the experiment from which it comes."""
+    clip: str
+    run: Path
+    """From the folder of all fits."""
+
+    def identity(self) -> str:
+        """64 characters that change with the experiment and with the content of its files."""
+        clips = [entry.with_paths(lambda path: Path(path.name)) for entry in self.experiment.clips]
+        text = experiment_to_toml(dataclasses.replace(self.experiment, clips=tuple(clips)))
+        contents = [
+            _digest(value)
+            for entry in self.experiment.clips
+            for value in vars(entry).values()
+            if isinstance(value, Path)
+        ]
+        return hashlib.sha256(repr((text, contents)).encode()).hexdigest()
+
+
+def plan(
+    experiments: Sequence[Experiment], seeds: int = 1, *, together: bool = False
+) -> list[FitTask]:
+    """All fits, in the order of experiments, clips and seeds; arguments as of `fit_many`.
+
+    Raises:
+        ValueError: there is no experiment, or not one seed; a capture of one of several clips is
+            fitted, which each would be alone.
+    """
+    if not experiments:
+        raise ValueError("no experiments; wanted one or more")
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise ValueError(f"seeds is {seeds}; wanted 1 to {MAX_SEEDS}")
+    names = _distinct([_stem(experiment) for experiment in experiments])
+    tasks = []
+    for name, experiment in zip(names, experiments, strict=True):
+        for clip, part, folder in _parts(_with_whole_paths(experiment), together=together):
+            for seed in range(experiment.seed, experiment.seed + seeds):
+                run = Path(RUNS, name, *folder, f"seed_{seed}")
+                tasks.append(FitTask(dataclasses.replace(part, seed=seed), name, clip, run))
+    return tasks
+
+
+def _parts(
+    experiment: Experiment, *, together: bool
+) -> list[tuple[str, Experiment, tuple[str, ...]]]:
+    """The name of what is fitted, its experiment, and its folder."""
+    clips = clip_names(experiment.clips)
+    if together:
+        return [(clips[0] if len(clips) == 1 else TOGETHER, experiment, ())]
+    file_tables.check_unnumbered(experiment.capture, str(experiment.path))
+    folders = _distinct([_file_name(clip) for clip in clips])
+    return [
+        (clip, _alone(experiment, entry), (folder,))
+        for clip, entry, folder in zip(clips, experiment.clips, folders, strict=True)
+    ]
+
+
+def _alone(experiment: Experiment, entry: ClipEntry) -> Experiment:
+    """The experiment with one of its clips, from which nothing differs any more."""
+    shared = dataclasses.replace(experiment.hierarchy, per_clip=(), per_subject=())
+    whole = None if experiment.whole is None else _alone(experiment.whole, entry)
+    return dataclasses.replace(experiment, clips=(entry,), hierarchy=shared, whole=whole)
+
+
+def _with_whole_paths(experiment: Experiment) -> Experiment:
+    """The experiment for a process in another folder."""
+    whole = None if experiment.whole is None else _with_whole_paths(experiment.whole)
+    clips = tuple(entry.with_paths(Path.absolute) for entry in experiment.clips)
+    return dataclasses.replace(experiment, clips=clips, whole=whole)
+
+
+def _stem(experiment: Experiment) -> str:
+    return _file_name(experiment.path.stem or experiment.name or "experiment")
+
+
+def _file_name(text: str) -> str:
+    """A name as a folder may have it on any system."""
+    return re.sub(r"[^\w.-]+", "_", text).strip("._")[:80] or "unnamed"
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number where several are alike."""
+    counts = Counter(name.casefold() for name in names)
+    return [
+        f"{name}_{number}" if counts[name.casefold()] > 1 else name
+        for number, name in enumerate(names, 1)
+    ]
+
+
+def _digest(path: Path) -> str:
+    """Of a file's content; of one that cannot be read, why, which the fit then says better."""
+    try:
+        status = path.stat()
+        return _digest_of_state(path, status.st_size, status.st_mtime_ns)
+    except OSError as error:
+        return str(error.strerror)
+
+
+@functools.lru_cache(maxsize=4096)  # a terrain may belong to thousands of clips
+def _digest_of_state(path: Path, size: int, changed: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class FittedValue(TypedDict):
+    """What a fit says of a parameter."""
+
+    value: Finite
+    unit: str
+    interval: Interval
+    """95 %."""
+    determined: bool
+
+
+class Outcome(TypedDict):
+    """What a fit found."""
+
+    converged: bool
+    fits: bool
+    verdict: str
+    """One sentence."""
+    cost_before: Finite
+    cost: Finite
+    starts: int
+    agreeing: int
+    steps: int
+    search_seconds: float
+    """Of the effort; all else prepares and assesses."""
+    frames: int
+    """Of its clips."""
+    parameters: dict[str, FittedValue]
+
+
+class Row(TypedDict):
+    """A fit that was tried."""
+
+    experiment: str
+    clip: str
+    seed: int
+    run: str
+    """From the folder of all fits."""
+    state: Literal["finished", "failed"]
+    error: str
+    """Why it failed, in one line; empty where it did not."""
+    identity: str
+    notes: list[str]
+    """Warnings."""
+    outcome: NotRequired[Outcome]
+    effort: NotRequired[Effort]
+
+
+ROW_FILE = JsonFile(
+    Row, "written by `jaxik fit-many`", "delete it to fit anew, or name another folder"
+)
+
+
+def outcome_of(fitted: Fit) -> Outcome:
+    """What a finished fit found."""
+    summary = fitted.summary
+    parameters: dict[str, FittedValue] = {
+        row["name"]: {
+            "value": row["value"],
+            "unit": row["unit"],
+            "interval": row["interval"],
+            "determined": row["determined"],
+        }
+        for row in summary["parameters"]
+    }
+    return {
+        "converged": summary["converged"],
+        "fits": summary["goodness"]["fits"],
+        "verdict": summary["goodness"]["sentence"],
+        "cost_before": summary["cost_before"],
+        "cost": summary["cost"],
+        "starts": summary["starts"],
+        "agreeing": summary["agreeing"],
+        "steps": summary["steps"],
+        "search_seconds": summary["seconds"],
+        "frames": sum(scene.frames.dt.shape[0] for scene in fitted.problem.data),
+        "parameters": parameters,
+    }
+
+
+def make_row(task: FitTask, error: str = "") -> Row:
+    """The row of a fit that could not be made, or of one that is whole but for what it found."""
+    return {
+        "experiment": task.name,
+        "clip": task.clip,
+        "seed": task.experiment.seed,
+        "run": task.run.as_posix(),
+        "state": "failed" if error else "finished",
+        "error": error,
+        "identity": task.identity(),
+        "notes": [],
+    }
+
+
+def read_row(folder: Path, task: FitTask) -> Row | None:
+    """The row of a fit that is whole already, in the folder of all fits; None if there is none.
+
+    Raises:
+        ValueError: the folder has the fit of an experiment that was changed since.
+    """
+    name = f"{task.run / ROW}"
+    if not (folder / name).is_file():
+        return None  # without the identity, which takes reading all of the clips
+    return row_store(folder).read(name, {"identity": task.identity()})
+
+
+def row_store(folder: Path) -> Store[Row]:
+    """The rows in the folder of all fits."""
+    return Store(
+        ROW_FILE, folder, "has the fit of another experiment, or of one that has changed since"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ManyFits:
+    """Many fits, each with its row, in the order in which they were planned."""
+
+    rows: tuple[Row, ...]
+    """None of fits that an interrupt has left out."""
+    total: int
+    folder: Path
+    elapsed: float = 0.0
+    """s, of this call."""
+    made: int = 0
+    """In this call."""
+    interrupted: bool = False
+
+    @property
+    def finished(self) -> list[Row]:
+        """The rows of fits that are whole."""
+        return [row for row in self.rows if row["state"] == "finished"]
+
+    @property
+    def failed(self) -> list[Row]:
+        """The rows of fits that could not be made."""
+        return [row for row in self.rows if row["state"] == "failed"]
+
+    @property
+    def outcomes(self) -> dict[str, Outcome]:
+        """What finished fits found, by run."""
+        return {row["run"]: row["outcome"] for row in self.rows if "outcome" in row}
+
+    @property
+    def efforts(self) -> list[Effort]:
+        """What finished fits took."""
+        return [row["effort"] for row in self.rows if "effort" in row]
+
+    @property
+    def unconverged(self) -> list[str]:
+        """The runs of finished fits whose search has not converged."""
+        return [run for run, outcome in self.outcomes.items() if not outcome["converged"]]
+
+    @property
+    def misfits(self) -> int:
+        """How many finished fits leave more of the motion over than noise of the given sigmas."""
+        return sum(not outcome["fits"] for outcome in self.outcomes.values())
+
+
+def columns(rows: Sequence[Row]) -> list[str]:
+    """The names of all columns; those of parameters last, in the order in which they appear."""
+    parameters = dict.fromkeys(
+        name for row in rows if "outcome" in row for name in row["outcome"]["parameters"]
+    )
+    each = [f"{name}{ending}" for name in parameters for ending in ("", ".low", ".high", ".known")]
+    return [*WHAT, "notes", *OUTCOME, *EFFORT, *each]
+
+
+def cells(row: Row) -> Cells:
+    """A row of the table; what it has not is left out.
+
+    Of each parameter: its value under its name, both ends of its 95 % interval, and whether the
+    clip determines it.
+    """
+    content: Cells = {key: row[key] for key in WHAT} | {"notes": "; ".join(row["notes"])}
+    if "outcome" in row:
+        outcome = row["outcome"]
+        content |= {key: outcome[key] for key in OUTCOME}
+        for name, fitted in outcome["parameters"].items():
+            low, high = fitted["interval"]
+            content |= {name: fitted["value"], f"{name}.low": low, f"{name}.high": high}
+            content[f"{name}.known"] = fitted["determined"]
+    if "effort" in row:
+        content |= {key: row["effort"][key] for key in EFFORT}
+    return content
+
+
+def write(folder: Path, rows: Sequence[Row]) -> list[str]:
+    """Writes the table; returns the names of its files, without that for which pyarrow is missing.
+
+    Raises:
+        ValueError: the folder cannot be written to.
+    """
+    names, content = columns(rows), [cells(row) for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(content)
+    files.write_text(folder / CSV, text.getvalue())
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        return [CSV]
+    table = pyarrow.table({name: [row.get(name) for row in content] for name in names})
+    files.write(folder / PARQUET, lambda path: pyarrow.parquet.write_table(table, path))
+    return [CSV, PARQUET]
 
 
 @in_float64
@@ -98,12 +463,12 @@ def fit_many(
                 tasks,
                 functools.partial(fit_task, folder, report=report),
                 functools.partial(read_row, folder),
-                line=many_report.row_line,
+                line=row_line,
                 name=lambda task: task.run.as_posix(),
                 failed=lambda task, error: make_row(task, in_one_line(error)),
             )
         missing, interrupted = len(campaign.missing), False
-        activity.log(many_report.plan_line(len(loaded), count, missing, seeds))
+        activity.log(plan_line(len(loaded), count, missing, seeds))
         if workers is None and scheduler is None:
             workers = usable_cores()
         try:
@@ -174,11 +539,11 @@ def _write(fits: ManyFits, experiments: Sequence[Experiment]) -> None:
     written: Sequence[str] = ()
     if fits.rows:
         with activity.announced("Writing the table"):
-            written = many_tasks.write(fits.folder, fits.rows)
-        if many_tasks.PARQUET not in written:
-            activity.log(many_tasks.MISSING)
+            written = write(fits.folder, fits.rows)
+        if PARQUET not in written:
+            activity.log(MISSING)
     folder = fits.folder if fits.rows else None
-    publish(folder, many_report.document(fits, experiments, written))
+    publish(folder, document(fits, experiments, written))
 
 
 class FailedError(RuntimeError):
@@ -248,3 +613,237 @@ def _check_shared_folder(folder: Path) -> None:
             f"{folder}: there is no such folder on this worker's machine; all machines of a "
             "cluster need the same files under the same paths"
         )
+
+
+def plan_line(experiments: int, tasks: int, missing: int, seeds: int) -> str:
+    """What is about to be done."""
+    of = f"{experiments} experiment{'s' * (experiments != 1)}"
+    seed = f", {seeds} seeds for each clip" if seeds > 1 else ""
+    left = "" if missing == tasks else f"; {tasks - missing} are there already"
+    return f"{tasks} fit{'s' * (tasks != 1)} of {of}{seed}{left}"
+
+
+def row_line(row: Row) -> str:
+    """A fit that ended, in one line."""
+    if "outcome" not in row:
+        return f"{row['run']}: FAILED: {row['error']}"
+    outcome = row["outcome"]
+    state = "" if outcome["converged"] else ", not converged"
+    seconds = f", {row['effort']['seconds']:.1f} s" if "effort" in row else ""
+    return f"{row['run']}: cost {number(outcome['cost'])}{seconds}{state}"
+
+
+def parameter_table(fits: ManyFits) -> Table:
+    """A row for each parameter of each experiment: where its fitted values lie."""
+    rows = [["experiment", "parameter", "unit", "median", "10 %", "90 %", "determined"]]
+    for (experiment, name), values in _by_parameter(fits.finished).items():
+        known = sorted(fitted["value"] for fitted in values if fitted["determined"])
+        figures = [number(q) for q in _quantiles(known)] or ["–"] * 3
+        count = f"{len(known)} of {len(values)}"
+        rows.append([experiment, name, values[0]["unit"], *figures, count])
+    return rows
+
+
+def _quantiles(values: Sequence[float]) -> list[float]:
+    """The median, and where the middle 80 % end; nothing of nothing."""
+    if not values:
+        return []
+    if len(values) == 1:
+        return [values[0]] * 3
+    tenths = statistics.quantiles(values, n=10, method="inclusive")
+    return [tenths[4], tenths[0], tenths[8]]
+
+
+def failure_table(fits: ManyFits) -> Table:
+    """The fits that failed, each with its error; of very many the first ones."""
+    rows = [["run", "error"]]
+    rows += [[row["run"], row["error"]] for row in fits.failed[:MANY]]
+    if len(fits.failed) > MANY:
+        rows.append(["…", f"and {len(fits.failed) - MANY} others"])
+    return rows
+
+
+def fit_table(fits: ManyFits) -> Table:
+    """A row for each fit; of very many the first ones."""
+    rows = [["run", "state", "cost", "determined", "seconds"]]
+    for row in fits.rows[:MANY]:
+        if "outcome" not in row:
+            rows.append([row["run"], "failed!", "–", "–", "–"])
+            continue
+        outcome = row["outcome"]
+        known = sum(fitted["determined"] for fitted in outcome["parameters"].values())
+        state = "converged" if outcome["converged"] else "not converged!"
+        seconds = f"{row['effort']['seconds']:.1f}" if "effort" in row else "–"
+        count = f"{known} of {len(outcome['parameters'])}"
+        rows.append([row["run"], state, number(outcome["cost"]), count, seconds])
+    if len(fits.rows) > MANY:
+        rows.append([f"and {len(fits.rows) - MANY} others", "", "", "", ""])
+    return rows
+
+
+def share_by_error(fits: ManyFits) -> list[str]:
+    """Errors without what differs from fit to fit, the most frequent first."""
+    counts = Counter(row["error"].rpartition(": ")[2] for row in fits.failed)
+    return [f"{percent(count / fits.total, 0)}: {error}" for error, count in counts.most_common(3)]
+
+
+def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> Document:
+    """What many fits say; `tables` are the files that have a row for each."""
+    title = (
+        "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
+        "grey where it does not; and how long fits took, on a logarithmic axis"
+    )
+    sections = []
+    if fits.finished:
+        grid = Grid(parameter_table(fits), "Fitted values of all fits")
+        plot = Plot(FIGURE, title, lambda: overview(fits, f"{fits.total} fits"))
+        sections.append(Section("Parameters", [grid, Text(SPREAD), plot]))
+    return Document(
+        file=SUMMARY,
+        kind="Many fits, each in a folder of its own",
+        title=listed([experiment.name for experiment in experiments]),
+        verdict=_verdict(fits),
+        good=not (fits.failed or fits.unconverged or fits.interrupted or fits.misfits),
+        findings=findings(fits),
+        sections=[
+            *sections,
+            Section("Failed", [Grid(failure_table(fits), "Fits that failed")]),
+            Section("Fits", [Grid(fit_table(fits), "All fits", brief=False)]),
+            Section("Limits of the data", [Points(LIMITS)]),
+        ],
+        asked=[
+            [experiment.name, f"{pages.system(experiment)}; {_clips(experiment)}"]
+            for experiment in experiments[:MANY]
+        ],
+        files={name: TABLES[name] for name in tables},
+    )
+
+
+@styled
+def overview(fits: ManyFits, title: str) -> Figure:
+    """Of each parameter the values of all fits; and the seconds that they took."""
+    series = list(_by_parameter(fits.finished).items())[:SHOWN]
+    figure, grid = panels(len(series) + 1, COLUMNS, title, 3.6, 1.0)
+    for axes, ((experiment, name), values) in zip(grid, series, strict=False):
+        _values(axes, values)
+        axes.set_title(f"{name}\n{experiment}", fontsize=12)
+    _seconds(grid[-1], fits.finished)
+    return figure
+
+
+def _by_parameter(rows: Sequence[Row]) -> dict[tuple[str, str], list[FittedValue]]:
+    """What fits say of each parameter of each experiment."""
+    series: dict[tuple[str, str], list[FittedValue]] = {}
+    for row in rows:
+        for name, fitted in row["outcome"]["parameters"].items() if "outcome" in row else ():
+            series.setdefault((row["experiment"], name), []).append(fitted)
+    return series
+
+
+def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
+    """Each fit's value with its 95 % interval, or a histogram of very many."""
+    unit = values[0]["unit"]
+    if len(values) > SINGLE:
+        known = [fitted["value"] for fitted in values if fitted["determined"]]
+        axes.hist([fitted["value"] for fitted in values], 40, color=BEFORE, label="all")
+        axes.hist(known, 40, color=AFTER, label="determined")
+        axes.set(xlabel=unit, ylabel="fits")
+        return
+    for row, fitted in enumerate(values, 1):
+        colour = AFTER if fitted["determined"] else BEFORE
+        axes.plot([row, row], fitted["interval"], color=colour, linewidth=1.2)
+        axes.plot(row, fitted["value"], ".", color=colour)
+    axes.set(xlabel="fit", ylabel=unit, xlim=(0.5, len(values) + 0.5))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
+    """How long fits took, and how much of that was their search."""
+    pairs = [
+        (row["effort"]["seconds"], row["outcome"]["search_seconds"])
+        for row in rows
+        if "effort" in row and "outcome" in row
+    ]
+    whole, search = np.array(pairs).T
+    # Logarithmic, for first fits compile and take a hundred times as long as those that follow.
+    ends = min(whole.min(), search.min()), max(whole.max(), search.max())
+    bins = np.geomspace(max(ends[0], SHORTEST) / 1.1, max(ends[1], SHORTEST) * 1.1, 30).tolist()
+    axes.hist(whole, bins, color=AFTER, alpha=0.8, label="fit")
+    axes.hist(search, bins, color=CAPTURED, alpha=0.6, label="its search")
+    axes.set(xlabel="time, s", ylabel="fits", xscale="log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_title("time of a fit", fontsize=12)
+    axes.margins(y=0.35)  # room for the legend
+    axes.legend(loc="upper right")
+
+
+def findings(fits: ManyFits) -> list[Finding]:
+    """Whether all are there, whether they converged, and what a fit takes."""
+    return [_completeness(fits), _convergence(fits), _effort(fits)]
+
+
+def _clips(experiment: Experiment) -> str:
+    count = len(experiment.clips)
+    return f"{count} clip{'s' * (count != 1)}"
+
+
+def _verdict(fits: ManyFits) -> str:
+    if fits.failed:
+        return f"{len(fits.failed)} failed"
+    if len(fits.finished) < fits.total:
+        return f"{fits.total - len(fits.finished)} are missing"
+    if fits.unconverged:
+        return f"{len(fits.unconverged)} not converged"
+    bad = fits.misfits
+    return f"All converged, {bad} do{'es' * (bad == 1)} not match" if bad else "All converged"
+
+
+def _completeness(fits: ManyFits) -> Finding:
+    missing = fits.total - len(fits.rows)
+    rest = f"the {missing} that {'is' if missing == 1 else 'are'} missing"
+    if fits.failed:
+        reasons = "; ".join(share_by_error(fits)).rstrip(".")
+        also = f" and makes {rest}" if missing else ""
+        return Finding(
+            f"{len(fits.failed)} of {fits.total} fits failed: {reasons}; the same command tries "
+            f"them again{also}.",
+            bad=True,
+        )
+    if missing:
+        return Finding(
+            f"{len(fits.finished)} of {fits.total} fits are finished; the same command makes "
+            f"{rest}.",
+            bad=True,
+        )
+    return Finding(f"All {fits.total} fits are finished.")
+
+
+def _convergence(fits: ManyFits) -> Finding:
+    outcomes = fits.outcomes
+    if not outcomes:
+        return Finding("No fit is finished, so nothing was found.", bad=True)
+    bad = fits.misfits
+    text = f"{len(outcomes) - bad} of {len(outcomes)} match the motion to within the given sigmas"
+    if fits.unconverged:
+        runs = listed(fits.unconverged)
+        return Finding(f"{len(fits.unconverged)} did not converge ({runs}); {text}.", bad=True)
+    return Finding(f"All finished searches converged; {text}.", bad=bad > 0)
+
+
+def _effort(fits: ManyFits) -> Finding:
+    efforts = fits.efforts
+    if not efforts:
+        return Finding("Nothing is known of what a fit takes.")
+    seconds = statistics.median(effort["seconds"] for effort in efforts)
+    peaks = [effort["peak_mb"] for effort in efforts if effort["peak_mb"] is not None]
+    memory = f", and at most {max(peaks):.0f} MB in a process" if peaks else ""
+    minutes = sum(effort["cpu_seconds"] for effort in efforts) / 60
+    cpu = f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+    hosts = len({effort["host"] for effort in efforts})
+    return Finding(
+        f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on {hosts} "
+        f"machine{'s' * (hosts != 1)}{memory}."
+    )
