@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -290,24 +290,8 @@ def _cpu_seconds() -> float:
     return time.process_time() + times.children_user + times.children_system
 
 
-class Hardware(TypedDict):
-    """The machine, as the JSON report holds it."""
-
-    cpu: str
-    cores: int | None
-    vector_bits: int | None
-    threads: int
-    """Used."""
-    memory_gb: float | None
-    device: str
-    jax: str
-    jaxlib: str
-    python: str
-    xla_flags: str
-
-
-def hardware() -> Hardware:
-    """The hardware and software of this process."""
+def hardware() -> dict[str, Any]:
+    """The hardware and software of this process, as the JSON report holds them."""
     device = jax.devices()[0]
     return {
         "cpu": _system_entry(CPU, "model name") or platform.processor() or platform.machine(),

@@ -59,7 +59,7 @@ def from_json(line: str) -> Finding | None:
 
 def examine(*, quick: bool) -> Iterator[Finding]:
     """Everything that there is to find; `quick` leaves the self-test out."""
-    yield from _guarded("packages", _installation)
+    yield from _guarded("packages", lambda: examine_installation())
     yield from _guarded("machine", examine_machine)
     yield from _guarded("JAX", lambda: _in_other_process(["--quick"] if quick else []))
 
@@ -80,11 +80,6 @@ def print_findings(findings: Iterator[Finding], width: int) -> int:
         print(f"! {finding.subject}: {finding.problem}\n  do: {finding.remedy}")
     print(f"{len(problems)} to mend" if problems else "all is well")
     return len(problems)
-
-
-def _installation() -> Iterator[Finding]:
-
-    return examine_installation()
 
 
 def _guarded(subject: str, examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 import argparse
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from .options import argument, command, flag
@@ -37,14 +38,12 @@ def parameters(options: argparse.Namespace) -> int:
     listed = guides.list_parameters(ik, options.search or "")
     if not listed:
         raise ValueError(f"no parameter of {options.preset} mentions {options.search!r}")
-    match options.format:
-        case "text":
-            text = guides.parameters_as_text(listed, _width(options.output))
-        case "markdown":
-            text = guides.parameters_as_markdown(listed)
-        case _:
-            text = guides.as_json(listed)
-    return _print_or_write(text, options.output)
+    return _print_or_write(
+        options,
+        lambda width: guides.parameters_as_text(listed, width),
+        lambda: guides.parameters_as_markdown(listed),
+        lambda: guides.as_json(listed),
+    )
 
 
 @command(*FORMAT)
@@ -60,29 +59,31 @@ def schema(options: argparse.Namespace) -> int:
     from fitting.experiment.schema import experiment_schema
     from fitting.report import guides
 
-    match options.format:
-        case "text":
-            text = guides.keys_as_text(experiment_schema(), _width(options.output))
-        case "markdown":
-            text = guides.keys_as_markdown(experiment_schema())
-        case _:
-            text = _schema_as_json()
-    return _print_or_write(text, options.output)
+    return _print_or_write(
+        options,
+        lambda width: guides.keys_as_text(experiment_schema(), width),
+        lambda: guides.keys_as_markdown(experiment_schema()),
+        _schema_as_json,
+    )
 
 
-def _width(output: Path | None) -> int:
-    """Columns of the terminal; of a file 100."""
-    return 100 if output is not None else shutil.get_terminal_size((100, 24)).columns
-
-
-def _print_or_write(text: str, output: Path | None) -> int:
+def _print_or_write(
+    options: argparse.Namespace,
+    as_text: Callable[[int], str],
+    as_markdown: Callable[[], str],
+    as_json: Callable[[], str],
+) -> int:
+    """Prints or writes the text of `FORMAT`; as wide as the terminal, or 100 columns in a file."""
     from fitting.runtime import files
 
-    if output is None:
+    width = 100 if options.output is not None else shutil.get_terminal_size((100, 24)).columns
+    forms = {"text": lambda: as_text(width), "markdown": as_markdown, "json": as_json}
+    text = forms[options.format]()
+    if options.output is None:
         show(text)
     else:
-        files.write_text(output, text + "\n")
-        print(f"written to {output}")
+        files.write_text(options.output, text + "\n")
+        print(f"written to {options.output}")
     return 0
 
 

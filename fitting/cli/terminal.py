@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, TextIO
 
 from fitting.runtime import activity
 from fitting.runtime.activity import Work
@@ -53,24 +53,7 @@ def watched() -> Iterator[None]:
         console_in_use.reset(token)
 
 
-@runtime_checkable
-class Stream(Protocol):
-    """Where text goes: a file, a pipe, a terminal."""
-
-    def write(self, text: str, /) -> int:
-        """Writes text."""
-        ...
-
-    def flush(self) -> None:
-        """Passes on what was written."""
-        ...
-
-    def isatty(self) -> bool:
-        """Whether it is a terminal."""
-        ...
-
-
-def can_draw(stream: Stream | None) -> bool:
+def can_draw(stream: TextIO | None) -> bool:
     """Whether a stream is a terminal that knows escape codes and lines; None is a closed one."""
     if stream is None or not stream.isatty():
         return False
@@ -79,7 +62,7 @@ def can_draw(stream: Stream | None) -> bool:
     return knows_lines and os.environ.get("TERM", "").lower() not in INCAPABLE
 
 
-def make_console(stream: Stream | None) -> "Console | None":
+def make_console(stream: TextIO | None) -> "Console | None":
     """What draws on a stream; None where nothing can, or where rich cannot be imported."""
     if not can_draw(stream):
         return None
@@ -87,9 +70,7 @@ def make_console(stream: Stream | None) -> "Console | None":
         from rich.console import Console
     except ImportError:  # `jaxik doctor` says so, and must be able to
         return None
-    return Console(
-        file=cast(IO[str], stream), force_terminal=True, highlight=False, markup=False, emoji=False
-    )
+    return Console(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False)
 
 
 def show(text: str) -> None:
@@ -133,7 +114,7 @@ class PlainLines(Shown):
     since what takes long cannot.
     """
 
-    def __init__(self, stream: Stream):
+    def __init__(self, stream: TextIO):
         self._stream = stream
         self._lock = threading.RLock()
         self._going_on: list[Work] = []

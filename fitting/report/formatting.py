@@ -61,6 +61,11 @@ def number(value: float) -> str:
     return f"{value:.4g}"
 
 
+def counted(count: int, noun: str) -> str:
+    """So many of something that has a regular plural."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def percent(fraction: float, digits: int = 1) -> str:
     """A fraction of 1 in per cent."""
     return f"{100 * fraction:.{digits}f} %"

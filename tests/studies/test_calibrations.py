@@ -29,7 +29,6 @@ from fitting.studies.calibrate.calibration import (
     Assessment,
     Calibration,
     assess,
-    summarise,
 )
 from support import small_studies
 from support.experiments import ROOT
@@ -225,7 +224,7 @@ def test_a_cluster_makes_the_same_replicates(made, experiment_file, tmp_path):
         address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
         with listening(reported=reports.append):
             assessment = fitting.calibrate(experiment_file, there, replicates=2, scheduler=address)
-    assert summarise(assessment) == summarise(assess(Calibration(made.kept.fits[:2], [])))
+    assert assessment.summary == assess(Calibration(made.kept.fits[:2], [])).summary
     here = kept(made.folder)
     assert all(here[name] == fit for name, fit in kept(there).items() if name.startswith("fits/"))
     assert {report["number"] for report in reports} == {0, 1}

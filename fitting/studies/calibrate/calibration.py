@@ -8,7 +8,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,7 +26,7 @@ from fitting.inference.proportions import Proportion, RankTest, proportion
 from fitting.problem.problem import Problem
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, percent
+from fitting.report.formatting import Table, counted, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, panels, styled
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
@@ -41,6 +41,7 @@ from .replicates import (
     LOG_PROBABILITY,
     SAME_VALLEY,
     WRITER,
+    Judgement,
     Kind,
     ReplicateChain,
     ReplicateFit,
@@ -95,12 +96,11 @@ class Calibration:
 
 
 @dataclasses.dataclass(frozen=True)
-class Assessment:
+class Assessment(Judgement):
     """All checks of a calibration, and what goes with them."""
 
     names: tuple[str, ...]
     """Of the parameters."""
-    replicates: int
     level: float
     """Of each check, so that all hold with `FAMILY_LEVEL`."""
     fit_coverage: Proportion
@@ -129,29 +129,23 @@ class Assessment:
     """Replicates whose chain did not converge, or has too few independent draws."""
 
     @property
-    def outside(self) -> list[str]:
-        """The checks that failed, in words."""
-        checks = {"the fit's 95 % intervals": self.fit_coverage.inside}
-        checks |= {
-            f"the fit's 95 % intervals of {name}": cover.inside
-            for name, cover in self.fit_coverage_of.items()
+    def checks(self) -> Mapping[str, Proportion | RankTest]:
+        """All claims that are checked."""
+        fits, posterior = "the fit's 95 % intervals", "the posterior's"
+        return {
+            fits: self.fit_coverage,
+            **{f"{fits} of {name}": cover for name, cover in self.fit_coverage_of.items()},
+            **{
+                f"the {percent(level, 0)} intervals of profiles": cover
+                for level, cover in self.profile_coverage.items()
+            },
+            "the share of fits in the right valley": self.valley,
+            **{
+                f"{posterior} {percent(level, 0)} intervals": cover
+                for level, cover in self.chain_coverage.items()
+            },
+            **{f"the ranks of {name}": test for name, test in self.ranks.items()},
         }
-        checks |= {
-            f"the {percent(level, 0)} intervals of profiles": cover.inside
-            for level, cover in self.profile_coverage.items()
-        }
-        checks["the share of fits in the right valley"] = self.valley.inside
-        checks |= {
-            f"the posterior's {percent(level, 0)} intervals": cover.inside
-            for level, cover in self.chain_coverage.items()
-        }
-        checks |= {f"the ranks of {name}": test.inside for name, test in self.ranks.items()}
-        return [words for words, inside in checks.items() if not inside]
-
-    @property
-    def inside(self) -> bool:
-        """Whether all checks passed."""
-        return not self.outside
 
 
 @in_float64
@@ -247,29 +241,25 @@ def assess(calibration: Calibration) -> Assessment:
     determined = _of_parameters(fits, "determined")
     width = _of_parameters(fits, "high") - _of_parameters(fits, "low")
     near = np.abs(_of_parameters(fits, "value") - truth) <= NEAR * width
-    wanted = (FIT_LEVEL, FIT_LEVEL)
-    at_least = (FIT_LEVEL, 1.0)  # of a threshold, whose interval ends with a plateau of the cost
-    together = (FIT_LEVEL, float(np.where(smooth, FIT_LEVEL, 1.0).mean()))
+    # A threshold's interval ends with a plateau of the cost: it may cover more than it promises.
+    most = np.where(smooth, FIT_LEVEL, 1.0)
+    share = functools.partial(proportion, level=level)
     chain_coverage, chain_coverage_of = _chain_coverage(chains, names, truth, level)
     return Assessment(
         names=names,
         replicates=len(fits),
         level=level,
-        fit_coverage=proportion(covered, level=level, wanted=together),
+        fit_coverage=share(covered, wanted=(FIT_LEVEL, float(most.mean()))),
         fit_coverage_of={
-            name: proportion(covered[:, [i]], level=level, wanted=wanted if smooth[i] else at_least)
+            name: share(covered[:, [i]], wanted=(FIT_LEVEL, float(most[i])))
             for i, name in enumerate(names)
         },
         profile_coverage={
-            nominal: proportion(levels <= nominal, level=level, wanted=(nominal, nominal))
-            for nominal in inner
+            nominal: share(levels <= nominal, wanted=(nominal, nominal)) for nominal in inner
         },
-        valley=proportion(right[:, None], level=level, wanted=(IN_VALLEY, 1.0)),
-        recovery=proportion(near, determined, level=level),
-        recovery_of={
-            name: proportion(near[:, [i]], determined[:, [i]], level=level)
-            for i, name in enumerate(names)
-        },
+        valley=share(right[:, None], wanted=(IN_VALLEY, 1.0)),
+        recovery=share(near, determined),
+        recovery_of={name: share(near[:, [i]], determined[:, [i]]) for i, name in enumerate(names)},
         wrong=numbers(~right),
         wrong_but_converged=numbers(~right & converged),
         unconverged=numbers(~converged),
@@ -280,40 +270,9 @@ def assess(calibration: Calibration) -> Assessment:
         chain_coverage=chain_coverage,
         chain_coverage_of=chain_coverage_of,
         short_chains=numbers(
-            np.asarray([not chain["converged"] or chain["draws"] < DRAWS for chain in chains], bool)
+            [not chain["converged"] or chain["draws"] < DRAWS for chain in chains]
         ),
     )
-
-
-def summarise(assessment: Assessment) -> dict[str, Any]:
-    """The numbers of an assessment as `calibration.json` holds them."""
-    fields = {
-        field.name: getattr(assessment, field.name)
-        for field in dataclasses.fields(assessment)
-        if field.name != "ranks"
-    }
-    ranks = {
-        name: {
-            "ranks": test.ranks.tolist(),
-            "draws": test.draws,
-            "inside": test.inside,
-        }
-        for name, test in assessment.ranks.items()
-    }
-    return {
-        "inside": assessment.inside,
-        "outside": assessment.outside,
-        **{name: _plain(value) for name, value in fields.items()},
-        "ranks": ranks,
-    }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Proportion):
-        return {**dataclasses.asdict(value), "inside": value.inside}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    return value
 
 
 def _of_parameters(fits: Sequence[ReplicateFit], key: str) -> np.ndarray:
@@ -330,18 +289,14 @@ def _chain_coverage(
     intervals = np.asarray([[chain["intervals"][name] for name in names] for chain in chains])
     low, high = np.moveaxis(intervals, -1, 0)
     covered = (low <= truth[..., None]) & (truth[..., None] <= high)
-    pooled = {
-        nominal: proportion(covered[..., k], level=level, wanted=(nominal, nominal))
-        for k, nominal in enumerate(LEVELS)
-    }
-    each = {
-        name: {
-            nominal: proportion(covered[:, [i], k], level=level, wanted=(nominal, nominal))
+
+    def shares(hits: np.ndarray) -> dict[float, Proportion]:
+        return {
+            nominal: proportion(hits[..., k], level=level, wanted=(nominal, nominal))
             for k, nominal in enumerate(LEVELS)
         }
-        for i, name in enumerate(names)
-    }
-    return pooled, each
+
+    return shares(covered), {name: shares(covered[:, [i]]) for i, name in enumerate(names)}
 
 
 def explanation(assessment: Assessment) -> str:
@@ -391,7 +346,7 @@ def document(experiment: Experiment, calibration: Calibration, assessment: Asses
         findings=findings(assessment),
         sections=[*sections, _limits(assessment)],
         asked=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
-        numbers={NUMBERS: {"experiment": name, **summarise(assessment)}},
+        numbers={NUMBERS: {"experiment": name, **assessment.summary}},
     )
 
 
@@ -569,8 +524,7 @@ def findings(assessment: Assessment) -> list[Finding]:
 
 def _intervals(assessment: Assessment) -> Finding:
     cover = assessment.fit_coverage
-    count = assessment.replicates
-    motions = f"{count} simulated motion{'s' * (count != 1)}"
+    motions = counted(assessment.replicates, "simulated motion")
     bounds = f"{percent(cover.low, 0)} to {percent(cover.high, 0)}"
     share = percent(cover.fraction, 0)
     coverage = f"the fit's 95 % intervals contain {share} of the true values ({bounds})"

@@ -33,6 +33,7 @@ from fitting.inference.optimise.solution import (
     StepsUsedUp,
 )
 from fitting.inference.profiles.profile import Profile, level_of
+from fitting.inference.proportions import Proportion, RankTest
 from fitting.inference.sample.posterior import Posterior
 from fitting.problem.problem import Problem, digest
 from fitting.problem.simulation import simulate
@@ -54,7 +55,7 @@ LOG_PROBABILITY = "log-probability"  # ranked beside the parameters
 IDENTITY = "identity.json"
 WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
 PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
-Result = TypeVar("Result")
+Result = TypeVar("Result", bound=Mapping[str, Any])
 SAME_VALLEY = 3.0  # of cost, above the lowest that a descent from the truth reaches
 
 
@@ -181,7 +182,45 @@ def _check(parameters: Sequence[str], result: Mapping[str, Any]) -> None:
         raise ValueError(f"its lists have different lengths, {sizes}")
 
 
-def numbers(where: np.ndarray) -> tuple[int, ...]:
+@dataclasses.dataclass(frozen=True)
+class Judgement:
+    """What is found in replicates; some of it is checked."""
+
+    replicates: int
+
+    @property
+    def checks(self) -> Mapping[str, Proportion | RankTest]:
+        """What is checked, by what is said of it where it is outside its bounds."""
+        raise NotImplementedError
+
+    @property
+    def outside(self) -> list[str]:
+        """The checks that failed, in words."""
+        return [words for words, share in self.checks.items() if not share.inside]
+
+    @property
+    def inside(self) -> bool:
+        """Whether all checks passed."""
+        return not self.outside
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The numbers as `calibration.json` holds them."""
+        fields = {key: _plain(value) for key, value in vars(self).items()}
+        return {"inside": self.inside, "outside": self.outside, **fields}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Proportion):
+        return {**dataclasses.asdict(value), "inside": value.inside}
+    if isinstance(value, RankTest):
+        return {"ranks": value.ranks.tolist(), "draws": value.draws, "inside": value.inside}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    return value
+
+
+def numbers(where: Sequence[bool] | np.ndarray) -> tuple[int, ...]:
     """Replicates for which something holds, counted from 1."""
     return tuple(int(i) + 1 for i in np.flatnonzero(where))
 

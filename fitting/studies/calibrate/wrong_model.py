@@ -53,7 +53,7 @@ from fitting.problem.simulation import displaced, with_motion_of
 from fitting.problem.space import free_parameter, make_space, present_value
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
-from fitting.report.formatting import Table, percent
+from fitting.report.formatting import Table, counted, percent
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64, with_floats
@@ -67,6 +67,7 @@ from .calibration import NUMBERS, SUMMARY, WIDE, listed_replicates, share_row
 from .replicates import (
     ADVICE,
     WRITER,
+    Judgement,
     Kind,
     Outcome,
     claim,
@@ -135,7 +136,7 @@ class PartDistances(TypedDict):
     held_out: MotionDistances
 
 
-class Judgement(TypedDict):
+class Verdict(TypedDict):
     """What a fit says of its motion, and what it rests on."""
 
     fits: bool
@@ -150,11 +151,11 @@ class WrongModelFit(Outcome):
     """Of the parameters of that system, by dotted name."""
     errors: dict[str, Finite]
     """Sizes of the capture's errors, as `ErrorSizes` has them."""
-    captured: Judgement
+    captured: Verdict
     """The fit against the capture, as `jaxik fit` reports it."""
-    lasting: Judgement
+    lasting: Verdict
     """The same fit against a capture with only the errors that last: no noise and no jumps."""
-    noise_free: Judgement
+    noise_free: Verdict
     """The same fit against the motion without errors."""
 
 
@@ -175,10 +176,9 @@ WRONG_MODEL = Kind("wrong_model", "fits", JsonFile(WrongModelFit, WRITER, ADVICE
 
 
 @dataclasses.dataclass(frozen=True)
-class WrongModelAssessment:
+class WrongModelAssessment(Judgement):
     """What was found, on frames that were held out unless a field says otherwise."""
 
-    replicates: int
     kept_no_worse: Proportion
     """How often the kept system is no further from the capture than the flat animation: by the root
     mean square over ankles, knees and pelvis."""
@@ -204,18 +204,12 @@ class WrongModelAssessment:
     unconverged: tuple[int, ...]
 
     @property
-    def outside(self) -> list[str]:
-        """The checks that failed, in words."""
-        checks = {
-            "the kept system against the animation": self.kept_no_worse.inside,
-            "the share of true verdicts": self.verdicts.inside,
+    def checks(self) -> Mapping[str, Proportion]:
+        """Both claims that are checked."""
+        return {
+            "the kept system against the animation": self.kept_no_worse,
+            "the share of true verdicts": self.verdicts,
         }
-        return [words for words, inside in checks.items() if not inside]
-
-    @property
-    def inside(self) -> bool:
-        """Whether all checks passed."""
-        return not self.outside
 
 
 @in_float64
@@ -343,7 +337,7 @@ def _against(fitted: Fit, made: Problem[jaxik.FootIK]) -> Fit:
     return dataclasses.replace(fitted, problem=problem)
 
 
-def _judged(fitted: Fit) -> Judgement:
+def _judged(fitted: Fit) -> Verdict:
     parts = {
         part: {motion: dict(kinds) for motion, kinds in motions.items()}
         for part, motions in fitted.distances.parts.items()
@@ -384,15 +378,15 @@ def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
         medians=_medians(noise_free, kept),
         worse=numbers(~kept_no_worse),
         false=numbers(~true),
-        unconverged=numbers(np.array([not fit["converged"] for fit in fits])),
+        unconverged=numbers([not fit["converged"] for fit in fits]),
     )
 
 
-def word(judgement: Judgement) -> str:
+def word(verdict: Verdict) -> str:
     """The verdict of a fit, one of `WORDS`."""
-    if judgement["fits"]:
+    if verdict["fits"]:
         return "fits"
-    return "worse" if distances_of(judgement).setbacks else "does not fit"
+    return "worse" if distances_of(verdict).setbacks else "does not fit"
 
 
 def is_true(fit: WrongModelFit) -> bool:
@@ -407,18 +401,9 @@ def is_true(fit: WrongModelFit) -> bool:
     return not fit["lasting"]["fits"] or _is_far(distances_of(fit["lasting"]), -1.0)
 
 
-def distances_of(judgement: Judgement) -> Distances:
+def distances_of(verdict: Verdict) -> Distances:
     """The distances as they were before a file held them."""
-    return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], judgement["distances"]))
-
-
-def summarise(assessment: WrongModelAssessment) -> dict[str, Any]:
-    """The numbers of an assessment as `calibration.json` holds them."""
-    return {
-        "inside": assessment.inside,
-        "outside": assessment.outside,
-        **dataclasses.asdict(assessment),
-    }
+    return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], verdict["distances"]))
 
 
 def _no_worse(distances: Distances, motion: Motion) -> bool:
@@ -595,21 +580,6 @@ def _displaced(joint: Transform, shift: Series, turn: Float[np.ndarray, "*joints
     return displaced(joint, shift, np.broadcast_to(turn, shift.shape))
 
 
-def sentence(assessment: WrongModelAssessment) -> str:
-    """What was found, in two sentences."""
-    count = assessment.replicates
-    motions = f"{count} motion{'s' * (count != 1)} of another system"
-    kept, true = assessment.kept_no_worse, assessment.verdicts
-    shares = (
-        f"The kept system is no worse than the animation in {kept.hits} of {kept.total} cases, and "
-        f"{true.hits} of {true.total} verdicts are true."
-    )
-    if assessment.inside:
-        return f"True under a wrong model: on {motions} everything is inside its bounds. {shares}"
-    outside = " and ".join(assessment.outside)
-    return f"Not true under a wrong model: on {motions}, outside their bounds: {outside}. {shares}"
-
-
 def explanation(truth: str) -> str:
     """What was done, and what the words mean."""
     unseen = ", ".join(f"{NAMES[kind]} {size(kind, value)}" for kind, value in UNSEEN.items())
@@ -710,23 +680,34 @@ def document(
         title=experiment.name,
         verdict="True" if assessment.inside else "Not true",
         good=assessment.inside,
-        findings=_findings(assessment),
+        findings=findings(assessment),
         sections=[*sections, Section("Limits of the data", [Points(LIMITS)])],
         asked=[
             *pages.rows(experiment),
             ["Made by", truth],
             ["Simulated motions", f"{assessment.replicates}"],
         ],
-        numbers={NUMBERS: {"experiment": experiment.name, "truth": truth, **summarise(assessment)}},
+        numbers={NUMBERS: {"experiment": experiment.name, "truth": truth, **assessment.summary}},
     )
 
 
-def _findings(assessment: WrongModelAssessment) -> list[Finding]:
+def findings(assessment: WrongModelAssessment) -> list[Finding]:
     """What was found, and whether there are too few motions for it."""
-    found = Finding(sentence(assessment), bad=not assessment.inside)
-    true = assessment.verdicts
-    if true.high - true.low <= WIDE:
-        return [found]
-    bounds = f"{percent(true.low, 0)} to {percent(true.high, 0)}"
-    few = f"So few motions prove little: the share of true verdicts may be {bounds}."
-    return [found, Finding(few, bad=True)]
+    kept, true = assessment.kept_no_worse, assessment.verdicts
+    motions = f"{counted(assessment.replicates, 'motion')} of another system"
+    shares = (
+        f"The kept system is no worse than the animation in {kept.hits} of {kept.total} cases, and "
+        f"{true.hits} of {true.total} verdicts are true."
+    )
+    text = f"True under a wrong model: on {motions} everything is inside its bounds. {shares}"
+    if not assessment.inside:
+        outside = " and ".join(assessment.outside)
+        text = (
+            f"Not true under a wrong model: on {motions}, outside their bounds: {outside}. {shares}"
+        )
+    lines = [Finding(text, bad=not assessment.inside)]
+    if true.high - true.low > WIDE:
+        bounds = f"{percent(true.low, 0)} to {percent(true.high, 0)}"
+        few = f"So few motions prove little: the share of true verdicts may be {bounds}."
+        lines.append(Finding(few, bad=True))
+    return lines

@@ -35,7 +35,7 @@ from fitting.experiment.experiment_files import experiment_to_toml, load_experim
 from fitting.experiment.in_memory import with_files
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, number, percent
+from fitting.report.formatting import Table, counted, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Effort, Stopwatch, first_alone, waiting_for
@@ -459,7 +459,7 @@ def fit_many(
         count = len(tasks)
         with activity.announced(f"Looking for finished fits among {count}"):
             campaign = Campaign(
-                f"Making {count} fit{'s' * (count != 1)}",
+                f"Making {counted(count, 'fit')}",
                 tasks,
                 functools.partial(fit_task, folder, report=report),
                 functools.partial(read_row, folder),
@@ -527,11 +527,8 @@ def _workers_line(hosts: Sequence[str], scheduler: str) -> str:
     """Who will compute on a running cluster: a host for each worker."""
     if not hosts:
         return f"no worker has joined yet; fits begin once one has: dask worker {scheduler}"
-    machines = len(set(hosts))
-    return (
-        f"{len(hosts)} worker{'s' * (len(hosts) != 1)} on {machines} "
-        f"machine{'s' * (machines != 1)}; more may join at any time"
-    )
+    where = f"{counted(len(hosts), 'worker')} on {counted(len(set(hosts)), 'machine')}"
+    return f"{where}; more may join at any time"
 
 
 def _write(fits: ManyFits, experiments: Sequence[Experiment]) -> None:
@@ -617,10 +614,10 @@ def _check_shared_folder(folder: Path) -> None:
 
 def plan_line(experiments: int, tasks: int, missing: int, seeds: int) -> str:
     """What is about to be done."""
-    of = f"{experiments} experiment{'s' * (experiments != 1)}"
+    of = counted(experiments, "experiment")
     seed = f", {seeds} seeds for each clip" if seeds > 1 else ""
     left = "" if missing == tasks else f"; {tasks - missing} are there already"
-    return f"{tasks} fit{'s' * (tasks != 1)} of {of}{seed}{left}"
+    return f"{counted(tasks, 'fit')} of {of}{seed}{left}"
 
 
 def row_line(row: Row) -> str:
@@ -636,7 +633,7 @@ def row_line(row: Row) -> str:
 def parameter_table(fits: ManyFits) -> Table:
     """A row for each parameter of each experiment: where its fitted values lie."""
     rows = [["experiment", "parameter", "unit", "median", "10 %", "90 %", "determined"]]
-    for (experiment, name), values in _by_parameter(fits.finished).items():
+    for (experiment, name), values in _by_parameter(fits).items():
         known = sorted(fitted["value"] for fitted in values if fitted["determined"])
         figures = [number(q) for q in _quantiles(known)] or ["–"] * 3
         count = f"{len(known)} of {len(values)}"
@@ -712,7 +709,10 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
             Section("Limits of the data", [Points(LIMITS)]),
         ],
         asked=[
-            [experiment.name, f"{pages.system(experiment)}; {_clips(experiment)}"]
+            [
+                experiment.name,
+                f"{pages.system(experiment)}; {counted(len(experiment.clips), 'clip')}",
+            ]
             for experiment in experiments[:MANY]
         ],
         files={name: TABLES[name] for name in tables},
@@ -722,20 +722,21 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
 @styled
 def overview(fits: ManyFits, title: str) -> Figure:
     """Of each parameter the values of all fits; and the seconds that they took."""
-    series = list(_by_parameter(fits.finished).items())[:SHOWN]
+    series = list(_by_parameter(fits).items())[:SHOWN]
     figure, grid = panels(len(series) + 1, COLUMNS, title, 3.6, 1.0)
     for axes, ((experiment, name), values) in zip(grid, series, strict=False):
         _values(axes, values)
         axes.set_title(f"{name}\n{experiment}", fontsize=12)
-    _seconds(grid[-1], fits.finished)
+    _seconds(grid[-1], fits)
     return figure
 
 
-def _by_parameter(rows: Sequence[Row]) -> dict[tuple[str, str], list[FittedValue]]:
+def _by_parameter(fits: ManyFits) -> dict[tuple[str, str], list[FittedValue]]:
     """What fits say of each parameter of each experiment."""
     series: dict[tuple[str, str], list[FittedValue]] = {}
-    for row in rows:
-        for name, fitted in row["outcome"]["parameters"].items() if "outcome" in row else ():
+    outcomes = fits.outcomes
+    for row in fits.finished:
+        for name, fitted in outcomes[row["run"]]["parameters"].items():
             series.setdefault((row["experiment"], name), []).append(fitted)
     return series
 
@@ -757,14 +758,10 @@ def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
+def _seconds(axes: Axes, fits: ManyFits) -> None:
     """How long fits took, and how much of that was their search."""
-    pairs = [
-        (row["effort"]["seconds"], row["outcome"]["search_seconds"])
-        for row in rows
-        if "effort" in row and "outcome" in row
-    ]
-    whole, search = np.array(pairs).T
+    whole = np.array([effort["seconds"] for effort in fits.efforts])
+    search = np.array([outcome["search_seconds"] for outcome in fits.outcomes.values()])
     # Logarithmic, for first fits compile and take a hundred times as long as those that follow.
     ends = min(whole.min(), search.min()), max(whole.max(), search.max())
     bins = np.geomspace(max(ends[0], SHORTEST) / 1.1, max(ends[1], SHORTEST) * 1.1, 30).tolist()
@@ -783,11 +780,6 @@ def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
 def findings(fits: ManyFits) -> list[Finding]:
     """Whether all are there, whether they converged, and what a fit takes."""
     return [_completeness(fits), _convergence(fits), _effort(fits)]
-
-
-def _clips(experiment: Experiment) -> str:
-    count = len(experiment.clips)
-    return f"{count} clip{'s' * (count != 1)}"
 
 
 def _verdict(fits: ManyFits) -> str:
@@ -844,6 +836,6 @@ def _effort(fits: ManyFits) -> Finding:
     cpu = f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
     hosts = len({effort["host"] for effort in efforts})
     return Finding(
-        f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on {hosts} "
-        f"machine{'s' * (hosts != 1)}{memory}."
+        f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on "
+        f"{counted(hosts, 'machine')}{memory}."
     )

@@ -44,7 +44,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, interval, number
+from fitting.report.formatting import Table, counted, interval, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
@@ -705,8 +705,8 @@ def _differences(population: Population) -> Finding:
         f"{listed(open_)} may differ" if open_ else "",
         f"{listed(alike)} {_verb(alike, 'is', 'are')} alike as far as they tell" if alike else "",
     ]
-    count = len(set(population.subjects))
-    who = f"{len(population.clips)} clips of {count} subject{'s' * (count != 1)}"
+    subjects = counted(len(set(population.subjects)), "subject")
+    who = f"{len(population.clips)} clips of {subjects}"
     few = len(population.clips) < FEW
     return Finding(
         f"Of {who}{', too few to say much of spreads' if few else ''}: "
