@@ -13,7 +13,6 @@ from fitting.report.style import STAGES, panels, styled
 from fitting.runtime import files, xla
 
 from .measurement import (
-    Figure,
     Measurement,
     Report,
     Series,
@@ -47,27 +46,12 @@ def _loads(report: Report) -> list[float]:
 
 
 def _numbers(measurement: Measurement) -> dict[str, object]:
-    plain = {
-        field.name: getattr(measurement, field.name)
-        for field in dataclasses.fields(measurement)
-        if field.name not in ("figures", "series", "work")
-    }
-    figures = [
-        dataclasses.asdict(figure) | {"met": figure.met, "closeness": figure.closeness}
-        for figure in measurement.figures
-    ]
-    series = [
-        dataclasses.asdict(curves)
-        | {"slopes": {name: curves.slope(name) for name in curves.seconds}}
-        for curves in measurement.series
-    ]
-    work = {name: dataclasses.asdict(work) for name, work in measurement.work.items()}
-    return plain | {
-        "figures": figures,
-        "series": series,
-        "work": work,
-        "medians": medians(measurement.samples),
-    }
+    numbers = dataclasses.asdict(measurement)
+    for figure, entry in zip(measurement.figures, numbers["figures"], strict=True):
+        entry |= {"met": figure.met, "closeness": figure.closeness}
+    for curves, entry in zip(measurement.series, numbers["series"], strict=True):
+        entry["slopes"] = {name: curves.slope(name) for name in curves.seconds}
+    return numbers | {"medians": medians(measurement.samples)}
 
 
 def _finite(value: PyTree) -> PyTree:
@@ -111,7 +95,11 @@ def text(report: Report) -> str:
     notes = [
         f"{measurement.name}: {note}"
         for measurement in report.measurements
-        for note in (*_notes(measurement.figures), *measurement.notes, *measurement.failures)
+        for note in (
+            *(f"{figure.what}: {figure.note}" for figure in measurement.figures if figure.note),
+            *measurement.notes,
+            *measurement.failures,
+        )
     ]
     parts = ["\n".join(lines), formatting.aligned(table(report))]
     if compiled:
@@ -127,11 +115,7 @@ def table(report: Report) -> formatting.Table:
     for measurement in report.measurements:
         for figure in measurement.figures:
             met = {True: "yes", False: "no", None: ""}[figure.met]
-            runs = (
-                formatting.interval(*(_short(end) for end in figure.spread))
-                if figure.spread
-                else ""
-            )
+            runs = formatting.interval(*map(_short, figure.spread)) if figure.spread else ""
             busy = "" if figure.busy is None else formatting.number(figure.busy)
             limit = "" if figure.limit is None else f"{_short(figure.limit):g}, {figure.bound}"
             closeness = "" if figure.closeness is None else formatting.percent(figure.closeness)
@@ -139,10 +123,6 @@ def table(report: Report) -> formatting.Table:
             cells = [figure.what, value, runs, busy, figure.target, met, limit, closeness]
             rows.append([measurement.name, *cells])
     return rows
-
-
-def _notes(figures: Sequence[Figure]) -> list[str]:
-    return [f"{figure.what}: {figure.note}" for figure in figures if figure.note]
 
 
 def _short(value: float) -> float:
@@ -173,12 +153,7 @@ def write(report: Report, numbers: Path | None, curves: Path | None) -> list[Pat
     if numbers is not None:
         files.write_text(numbers, to_json(report))
         written.append(numbers)
-    series = [
-        one_size
-        for measurement in report.measurements
-        for one_size in measurement.series
-        if one_size.sizes
-    ]
+    series = [each for measured in report.measurements for each in measured.series if each.sizes]
     if curves is not None and series:
         machine = hardware()
         title = f"{machine['cpu']}, {machine['threads']} threads"

@@ -156,10 +156,10 @@ def make_replicates(
         f"Making the {kind.word} of {len(sources)} replicates",
         sources,
         make,
-        lambda source: store.read(path(source), {"number": _number(source)}),
-        lambda source, result: store.write(path(source), result),
-        kind.line,
-        lambda source: f"replicate {_number(source) + 1}",
+        read=lambda source: store.read(path(source), {"number": _number(source)}),
+        write=lambda source, result: store.write(path(source), result),
+        line=kind.line,
+        name=lambda source: f"replicate {_number(source) + 1}",
     ).run(client)
 
 
