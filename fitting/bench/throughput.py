@@ -180,8 +180,10 @@ def of_workers(count: int) -> dict[str, float]:
         path.write_text(EXPERIMENT, encoding="utf-8")
         fitting.fit_many(path, Path(folder, "first"), workers=1, report=False)  # compiles
         began = time.monotonic()
-        made = fitting.fit_many(path, Path(folder, "fits"), seeds=FITS, workers=count, report=False)
-        efforts = [row["effort"] for row in made.finished if "effort" in row]
+        many_fits = fitting.fit_many(
+            path, Path(folder, "fits"), seeds=FITS, workers=count, report=False
+        )
+        efforts = many_fits.efforts
         return {
             "seconds": time.monotonic() - began,
             "cpu_seconds": sum(effort["cpu_seconds"] for effort in efforts),

@@ -190,12 +190,12 @@ def calibrate(
             f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}"
         )
         with cluster.connect(workers, scheduler) as client:
-            made = make_fits_and_chains(
+            calibration = make_fits_and_chains(
                 experiment, problem, folder, replicates,
                 chains=chains, noise_factor=noise_factor, client=client,
             )  # fmt: skip
-        assessment = assess(made)
-        publish(folder, document(experiment, made, assessment))
+        assessment = assess(calibration)
+        publish(folder, document(experiment, calibration, assessment))
         return assessment
 
 
@@ -368,12 +368,12 @@ def remarks(assessment: Assessment) -> list[str]:
 
 def listed_replicates(sentences: Mapping[str, tuple[int, ...]]) -> list[str]:
     """A sentence for each kind of replicates of which there are any, with their numbers."""
-    return [f"{words}: {_some_of(found)}." for words, found in sentences.items() if found]
+    return [f"{words}: {_some_of(those)}." for words, those in sentences.items() if those]
 
 
-def _some_of(found: tuple[int, ...]) -> str:
-    shown = ", ".join(map(str, found[:LISTED]))
-    return f"{shown}{' and others' if len(found) > LISTED else ''} ({len(found)} in all)"
+def _some_of(replicates: tuple[int, ...]) -> str:
+    first = ", ".join(map(str, replicates[:LISTED]))
+    return f"{first}{' and others' if len(replicates) > LISTED else ''} ({len(replicates)} in all)"
 
 
 def checks_table(assessment: Assessment) -> Table:
@@ -422,9 +422,9 @@ def parameter_table(assessment: Assessment) -> Table:
 
 def share_row(words: str, share: Proportion, wanted: str) -> list[str]:
     """Cells of a claim: what was found, its share and bounds, what is wanted, whether it is so."""
-    found = f"{share.hits} of {share.total}"
+    hits = f"{share.hits} of {share.total}"
     fraction = percent(share.fraction) if share.total else "–"
-    return [words, found, fraction, _bounds(share), wanted, _verdict(share)]
+    return [words, hits, fraction, _bounds(share), wanted, _verdict(share)]
 
 
 def _bounds(share: Proportion) -> str:

@@ -340,9 +340,9 @@ def fit_simulated(
 def fit_line(fitted: ReplicateFit) -> str:
     """A finished fit in one line, for the terminal."""
     gap = fitted["cost"] - fitted["truth_valley_cost"]
-    found = "the truth's valley" if gap <= SAME_VALLEY else f"a valley {gap:.1f} above the truth's"
+    end = "the truth's valley" if gap <= SAME_VALLEY else f"a valley {gap:.1f} above the truth's"
     return (
-        f"replicate {fitted['number'] + 1}: {found}, {fitted['agreeing']} of {fitted['starts']} "
+        f"replicate {fitted['number'] + 1}: {end}, {fitted['agreeing']} of {fitted['starts']} "
         f"starts agree{'' if fitted['converged'] else ', not converged'}; {fitted['seconds']:.1f} s"
     )
 

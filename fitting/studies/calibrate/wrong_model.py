@@ -305,10 +305,10 @@ def fit_wrong_model(
     rig = problem.data[0].rig if experiment.body == "clip" else None
     ik, values = draw_system(truth, rig, random)
     masked = [clip.mask_pops for clip in experiment.clips]
-    made, sizes = with_motion_of(problem, ik), draw_sizes(random, noise_factor)
+    exact, sizes = with_motion_of(problem, ik), draw_sizes(random, noise_factor)
     lasting_sizes = dataclasses.replace(sizes, pop=0.0, noise=0.0)
-    lasting = with_errors(made, lasting_sizes, masked, copy.deepcopy(random))
-    captured = with_errors(made, sizes, masked, random)
+    lasting = with_errors(exact, lasting_sizes, masked, copy.deepcopy(random))
+    captured = with_errors(exact, sizes, masked, random)
     own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
     fitted = fit_simulated(captured, own)
     return {
@@ -317,11 +317,11 @@ def fit_wrong_model(
         "errors": dataclasses.asdict(sizes),
         "captured": _judged(fitted),
         "lasting": _judged(_against(fitted, lasting)),
-        "noise_free": _judged(_against(fitted, made)),
+        "noise_free": _judged(_against(fitted, exact)),
     }
 
 
-def _against(fitted: Fit, made: Problem[jaxik.FootIK]) -> Fit:
+def _against(fitted: Fit, other: Problem[jaxik.FootIK]) -> Fit:
     """A fit as it is judged by other references, on the frames that were seen in its own."""
     references = [
         dataclasses.replace(
@@ -329,7 +329,7 @@ def _against(fitted: Fit, made: Problem[jaxik.FootIK]) -> Fit:
             observed=seen.reference.observed,
             held_out=seen.reference.held_out,
         )
-        for scene, seen in zip(made.data, fitted.problem.data, strict=True)
+        for scene, seen in zip(other.data, fitted.problem.data, strict=True)
     ]
     problem = eqx.tree_at(
         lambda problem: [scene.reference for scene in problem.data], fitted.problem, references

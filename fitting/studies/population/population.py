@@ -91,8 +91,8 @@ COLOURS = dict(zip(ERROR_NAMES, (BEFORE, CAPTURED, AFTER, STAGES[1], STAGES[4]),
 PANELS_PER_ROW = 3
 
 
-class Found(TypedDict):
-    """The result of a search, as its file holds it."""
+class SearchResult(TypedDict):
+    """What a search has found, as its file holds it."""
 
     name: str
     """What was fitted."""
@@ -105,8 +105,8 @@ class Found(TypedDict):
     """Where it was estimated."""
 
 
-FOUND_FILE = JsonFile(
-    Found, "written by `jaxik population`", "delete it, and its search is made anew"
+RESULT_FILE = JsonFile(
+    SearchResult, "written by `jaxik population`", "delete it, and its search is made anew"
 )
 
 
@@ -125,7 +125,7 @@ def _task(name: str, problem: Problem[jaxik.FootIK], experiment: Experiment) -> 
     return SearchTask(name, problem, experiment, search_identity(problem, experiment)[:16])
 
 
-def _search_all(title: str, tasks: Sequence[SearchTask], folder: Path | None) -> list[Found]:
+def _search_all(title: str, tasks: Sequence[SearchTask], folder: Path | None) -> list[SearchResult]:
     """The results of searches, those that are stored and new ones, which are stored.
 
     Raises:
@@ -138,28 +138,28 @@ def _search_all(title: str, tasks: Sequence[SearchTask], folder: Path | None) ->
     def checkpoints(task: SearchTask) -> Checkpoints:
         return Checkpoints(folder, f"{task.key}.part", task.key)
 
-    def search(task: SearchTask) -> Found:
+    def search(task: SearchTask) -> SearchResult:
         with checkpoints(task):
             return _search(task)
 
-    def read(task: SearchTask) -> Found | None:
-        if (found := store.read(f"{task.key}.json")) is not None:
+    def read(task: SearchTask) -> SearchResult | None:
+        if (result := store.read(f"{task.key}.json")) is not None:
             checkpoints(task).remove()
-        return found
+        return result
 
-    def write(task: SearchTask, found: Found) -> None:
-        store.write(f"{task.key}.json", found)
+    def write(task: SearchTask, result: SearchResult) -> None:
+        store.write(f"{task.key}.json", result)
         checkpoints(task).remove()
 
-    return Campaign(title, tasks, search, read, write, found_line, lambda task: task.name).run()
+    return Campaign(title, tasks, search, read, write, result_line, lambda task: task.name).run()
 
 
-def _search(task: SearchTask) -> Found:
+def _search(task: SearchTask) -> SearchResult:
     with activity.announced(f"Fitting {task.name}"):
         fitted, solution = search_with_noise(task.problem, task.experiment)
     if solution.interrupted:
         raise KeyboardInterrupt
-    found: Found = {
+    result: SearchResult = {
         "name": task.name,
         "u": solution.u.tolist(),
         "cost": solution.cost,
@@ -168,27 +168,27 @@ def _search(task: SearchTask) -> Found:
         "seconds": solution.seconds,
     }
     if task.experiment.noise.estimates_any:
-        found["noise"] = dataclasses.asdict(noise_of(fitted))
-    return found
+        result["noise"] = dataclasses.asdict(noise_of(fitted))
+    return result
 
 
-def found_line(found: Found) -> str:
+def result_line(result: SearchResult) -> str:
     """A finished search in one line, for the terminal."""
-    return f"{found['name']}: cost {number(found['cost'])}, {found['seconds']:.1f} s"
+    return f"{result['name']}: cost {number(result['cost'])}, {result['seconds']:.1f} s"
 
 
-def search_store(folder: Path | None, size: int) -> Store[Found]:
+def search_store(folder: Path | None, size: int) -> Store[SearchResult]:
     """The results of searches for so many parameters."""
 
-    def check(found: Found) -> None:
-        if len(found["u"]) != size:
+    def check(result: SearchResult) -> None:
+        if len(result["u"]) != size:
             raise ValueError(
-                f"u has {len(found['u'])} numbers; wanted {size}, one of each parameter"
+                f"u has {len(result['u'])} numbers; wanted {size}, one of each parameter"
             )
-        if "noise" in found:
-            NoiseModel(**found["noise"])  # checks its numbers
+        if "noise" in result:
+            NoiseModel(**result["noise"])  # checks its numbers
 
-    return Store(FOUND_FILE, folder, check=check)
+    return Store(RESULT_FILE, folder, check=check)
 
 
 class Estimate(TypedDict):
@@ -377,9 +377,9 @@ class Population:
     """A name for each."""
     subjects: tuple[str, ...]
     """Whom each shows; the clip's own name where the experiment does not say."""
-    alone: tuple[Found, ...]
-    pooled: Found
-    others: tuple[Found, ...]
+    alone: tuple[SearchResult, ...]
+    pooled: SearchResult
+    others: tuple[SearchResult, ...]
     """All clips but each, pooled."""
     fit: PopulationFit
     parameters: list[ParameterEstimates]
@@ -394,7 +394,7 @@ class Population:
     def unconverged(self) -> list[str]:
         """What has not converged, in a sentence each."""
         searches = (*self.alone, self.pooled, *self.others)
-        lines = [f"{one['name']}: {one['message']}" for one in searches if not one["converged"]]
+        lines = [f"{of['name']}: {of['message']}" for of in searches if not of["converged"]]
         if not self.fit.converged:
             lines.append(f"population: not converged after {self.fit.rounds} rounds")
         return lines
@@ -449,8 +449,8 @@ def fit_clips_and_population(
     tasks = [_task(*pair, experiment) for pair in zip(clips, singles, strict=True)]
     alone = _search_all(f"Fitting {len(clips)} clips, each alone", tasks, folder)
     problems = [
-        with_noise(single, NoiseModel(**found["noise"])) if "noise" in found else single
-        for single, found in zip(singles, alone, strict=True)
+        with_noise(single, NoiseModel(**result["noise"])) if "noise" in result else single
+        for single, result in zip(singles, alone, strict=True)
     ]
     whole = _joined(problem, problems)
     known = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
@@ -458,7 +458,7 @@ def fit_clips_and_population(
     tasks = [_task(EVERYTHING, whole, known)]
     tasks += [_task(rest, without_clip(whole, c), known) for c, rest in enumerate(rests)]
     pooled, *others = _search_all("Fitting all clips, and all but each", tasks, folder)
-    alone_u, pooled_u = np.array([found["u"] for found in alone]), np.array(pooled["u"])
+    alone_u, pooled_u = np.array([result["u"] for result in alone]), np.array(pooled["u"])
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     with activity.announced("Fitting the population"):
         fit = fit_population(problems, grouping, starts)
@@ -546,13 +546,13 @@ def _difference(population: Population, row: ParameterEstimates) -> str:
     spread, things = row["spread"], f"{row['level']}s"
     assert spread is not None and spread["interval"] is not None  # of a parameter that varies
     low, high = spread["interval"]
-    found = f"spread {number(spread['value'])}"
+    size = f"spread {number(spread['value'])}"
     count = len(set(population.subjects if row["level"] == "subject" else population.clips))
     few = f", from {count} {things} only" if count < FEW else ""
     if low > 0:
-        words = f"differs between {things}: {found} ({interval(low, high)})"
+        words = f"differs between {things}: {size} ({interval(low, high)})"
     elif spread["value"] > 0:
-        words = f"may differ between {things}: {found}, at most {high:.4g}"
+        words = f"may differ between {things}: {size}, at most {high:.4g}"
     else:
         words = f"is alike in all {things} as far as they tell: spread at most {high:.4g}"
     return f"`{row['name']}` {words}{few}."
@@ -715,8 +715,8 @@ def _differences(population: Population) -> Finding:
     )
 
 
-def _verb(names: list[str], one: str, several: str) -> str:
-    return one if len(names) == 1 else several
+def _verb(names: list[str], singular: str, plural: str) -> str:
+    return singular if len(names) == 1 else plural
 
 
 def _prediction(population: Population) -> Finding:
