@@ -18,7 +18,7 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.file_tables import COMPLETE, Ablation
 from fitting.experiment.problems import ClipData
 from fitting.inference.noise import NoiseOptions
-from fitting.inference.optimise.solution import Progress, Solution
+from fitting.inference.optimise.solution import Solution
 from fitting.motion.accuracy import Accuracy
 from fitting.report import pages
 from fitting.report.formatting import ACCURACY
@@ -41,10 +41,8 @@ class Search:
     def __init__(self) -> None:
         self.calls: list = []
 
-    def __call__(self, problem, experiment, progress):
+    def __call__(self, problem, experiment):
         self.calls.append((problem, experiment))
-        if progress is not None:
-            progress(Progress("polish", 0, 1, 2.0, 1.0, 0.5))
         names = problem.space.names
         frames = sum(int(scene.reference.observed.sum()) for scene in problem.data)
         best = {name: 0.3 if name != "pelvis.on_gain" else frames / 1000 for name in names}
