@@ -1,10 +1,12 @@
-"""The shapes that the pipeline takes, checked as it is traced: no cost at run time."""
+"""What the pipeline takes: shapes, checked as it is traced, at no cost at run time, and floats."""
 
 import dataclasses
 import typing
 from collections.abc import Iterator
+from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
@@ -15,8 +17,19 @@ from jaxik.world.frame import Frame
 from jaxik.world.skeleton import LegPose, Rig
 from jaxik.world.terrain import LegTerrains, Terrain
 
+Tree = TypeVar("Tree")
 Shape = tuple[int, ...]
 BATCHES = "many characters at once need jax.vmap or jaxik.lanes"
+
+
+def with_floats_of(rig: Rig, tree: Tree) -> Tree:
+    """The tree with all its floats as wide as those of the rig, which memory has too."""
+    floats = rig.side.dtype
+
+    def convert(leaf: Array) -> Array:
+        return jnp.asarray(leaf, floats) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(convert, tree)
 
 
 def check_system(ik: Rule, rig: Rig) -> None:

@@ -19,7 +19,7 @@ from jaxik.world.terrain import LegTerrains, Terrain
 from .centring import recentred
 from .faults import Faults, clean, per_leg, remembered
 from .phases import advance, pose, sense, sense_first, watch
-from .shapes import check_inputs, check_state
+from .shapes import check_inputs, check_state, with_floats_of
 from .system import Advanced, FootIK, Result, State, fresh_memory, init, restarted
 from .tracks import Tracks, read_tracks, system_at
 
@@ -79,6 +79,10 @@ def step(
     check_inputs(ik, inputs, clip=False)
     fresh = init(ik, rig)
     check_state(state, fresh)
+    ik, rig, terrain, state, frame, gate = with_floats_of(
+        rig, (ik, rig, terrain, state, frame, gate)
+    )
+    inputs = Inputs(rig, terrain, frame, gate)
     faults = None
     if not checked:
         frame, faults = clean(frame, rig.present)
@@ -133,7 +137,10 @@ def resume(
     check_inputs(ik, inputs, clip=True)
     fresh = init(ik, rig)
     check_state(state, fresh)
-
+    ik, rig, terrain, state, frames, gate = with_floats_of(
+        rig, (ik, rig, terrain, state, frames, gate)
+    )
+    inputs = Inputs(rig, terrain, frames, gate)
     values = read_tracks(ik, tracks, frames.dt.shape[0], rig.side.shape[0])
     faults = None
     if not checked:

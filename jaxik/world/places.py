@@ -63,10 +63,15 @@ def moved(
         return value + by_ws
 
     def moved_struct(value: Any) -> Any:
-        if isinstance(value, tuple | list):
-            return type(value)(map(moved_struct, value))
         if not dataclasses.is_dataclass(value) or isinstance(value, type):
-            return value
+            parts = jax.tree.leaves(value, is_leaf=dataclasses.is_dataclass)
+            if not any(map(dataclasses.is_dataclass, parts)):
+                return value
+            return jax.tree.map(
+                lambda part: moved_struct(part) if dataclasses.is_dataclass(part) else part,
+                value,
+                is_leaf=dataclasses.is_dataclass,
+            )
         changes = {}
         for field in dataclasses.fields(value):
             inner, kind = getattr(value, field.name), field.metadata.get("place")

@@ -388,6 +388,19 @@ def test_a_single_precision_program_contains_no_doubles(system: str):
     assert list(doubles(leak.jaxpr)), "the check notices doubles"
 
 
+@pytest.mark.parametrize("narrow", ["ik", "rig", "terrain", "frames"])
+def test_floats_of_mixed_width_become_those_of_the_rig(narrow: str):
+    names = ("ik", "rig", "terrain", "frames")
+    inputs: dict[str, Any] = dict(zip(names, Row(DRIFTING, wander()).inputs()[:4], strict=True))
+    inputs[narrow] = single(inputs[narrow])
+    ik, rig, ground, frames = inputs.values()
+    after, result = jax.eval_shape(jaxik.resume, *(ik, rig, ground, jaxik.init(ik, rig), frames))
+    floats = [x for x in jax.tree.leaves((after, result)) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32 if narrow == "rig" else jnp.float64)}
+    state = jax.eval_shape(jaxik.step, *(ik, rig, ground, jaxik.init(ik, rig), at(frames, 0)))[0]
+    assert [x.dtype for x in jax.tree.leaves(state)] == [x.dtype for x in jax.tree.leaves(after)]
+
+
 def test_only_the_smooth_program_contains_a_sigmoid():
     hard, smooth = (
         set(re.findall(r"= (\w+)", str(program.jaxpr)))

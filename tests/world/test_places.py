@@ -1,7 +1,7 @@
 """Places: what moves with the world's origin, and surfaces about another one."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,6 +122,11 @@ class Memory:
     inner: Any
 
 
+class Pair(NamedTuple):
+    inner: Any
+    length: float
+
+
 def test_declared_places_move_and_nothing_else():
     by, up = jnp.array([1.0, 2.0, 4.0]), jnp.array([0.0, 0.6, 0.8])
     legs_up = jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -141,3 +146,9 @@ def test_declared_places_move_and_nothing_else():
     np.testing.assert_allclose(after.inner[0].point, point + by)
     assert after.inner[0].length == 7.0
     assert after.inner[1] is None
+    for part in (Pair(inner, 2.0), [inner, 2.0], {"inner": inner, "length": 2.0}):
+        moved = places.moved(part, by, up, legs_up)
+        assert type(moved) is type(part)
+        place, length = jax.tree.leaves(moved, is_leaf=lambda value: isinstance(value, Memory))
+        np.testing.assert_allclose(place.point, point + by)
+        assert length == 2.0
