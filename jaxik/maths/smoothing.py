@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from . import vec
 
 LN2 = 0.6931471805599453
-JUMP_GAP = 1e-4  # m: the clamped speed closes smaller gaps at once
+JUMP_GAP = 1e-6  # m: the clamped speed closes smaller gaps at once
+ARRIVED = 1e-5  # of a weight: what rounding may leave of a gap that a whole number of steps closes
 
 
 class Motion(NamedTuple):
@@ -62,7 +63,7 @@ def fraction_of_half_life(half_life: Array, dt: Array) -> Array:
 def fraction_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
     """Fraction of the gap closed in `dt` s by Unreal's `FInterpTo`: `clamp(dt speed, 0, 1)`.
 
-    Jumps at a speed of 0 or less and over gaps below 0.1 mm. Depends on the frame rate: the
+    Jumps at a speed of 0 or less and over gaps below 1 µm. Depends on the frame rate: the
     half-life is -ln 2 dt / ln(1 - dt speed).
     """
     fraction = jnp.clip(dt * speed, 0.0, 1.0)
@@ -70,9 +71,14 @@ def fraction_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
 
 
 def move_towards(value: Array, goal: Array, step: Array) -> Array:
-    """`value` moved towards `goal` by `step` (0 or more), but not past it."""
+    """A weight moved towards `goal` by `step` (0 or more), but not past it.
+
+    The step with which it arrives may be longer by `ARRIVED`. So it is the same step, with the
+    same derivative, whichever way the steps before it were rounded.
+    """
     gap = goal - value
-    return value + jnp.where(gap > step, step, jnp.where(gap < -step, -step, gap))
+    longest = step + jnp.where(step > 0, ARRIVED, 0.0)
+    return value + jnp.where(gap > longest, step, jnp.where(gap < -longest, -step, gap))
 
 
 def step_of_time(time: Array, dt: Array) -> Array:

@@ -3,6 +3,7 @@
 The hard gate decides, the smooth one converges to it. Laws are exact at any frame time.
 """
 
+import functools
 import itertools
 from collections.abc import Callable
 
@@ -227,12 +228,31 @@ def test_a_half_life_closes_half_of_the_gap_or_all_if_it_is_zero_and_none_if_inf
 
 
 def test_the_clamped_speed_equals_unreals_interp_to():
-    gaps = [0.0, 9e-5, -9e-5, 1.1e-4, -1.1e-4, 1.0]
+    gaps = [0.0, 9e-7, -9e-7, 1.1e-6, -1.1e-6, 1.0]
     cases = itertools.product([-1.0, 0.0, 0.7, 25.0, 40.0], [1 / 240, 1 / 30, 0.5], gaps)
     speed, dt, gap = np.array(list(cases)).T
     jumps = (speed <= 0) | (np.abs(gap) <= smoothing.JUMP_GAP)
     expected = np.where(jumps, 1.0, np.minimum(dt * speed, 1.0))
     assert_allclose(call(smoothing.fraction_of_speed, speed, dt, gap), expected, rtol=1e-15)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def fades(start: float, goal: float, time: ArrayLike, frames: int) -> jax.Array:
+    """A weight after so many frames of 1/60 s that goes all the way in `time`, s."""
+    start, step = jnp.asarray(start), smoothing.step_of_time(jnp.asarray(time), jnp.asarray(1 / 60))
+    toward = functools.partial(smoothing.move_towards, goal=jnp.asarray(goal), step=step)
+    return jax.lax.fori_loop(0, frames, lambda _, weight: toward(weight), start)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_weight_arrives_with_a_whole_number_of_steps_however_these_are_rounded(dtype):
+    for frames in (3, 12, 49, 60):
+        for start, goal in ((dtype(0.0), dtype(1.0)), (dtype(1.0), dtype(0.0))):
+            arrives, slope = jax.value_and_grad(fades, 2)(start, goal, dtype(frames / 60), frames)
+            assert arrives == goal and slope == 0
+    gradual = jax.grad(fades, 2)(dtype(0.0), dtype(1.0), dtype(0.2), 11)
+    assert_allclose(gradual, -11 / 60 / 0.2**2, rtol=1e-5)
+    assert smoothing.move_towards(*map(jnp.asarray, (1.0 - 1e-6, 1.0, 0.0))) == 1.0 - 1e-6
 
 
 def test_the_half_life_of_a_clamped_speed_depends_on_the_frame_time():
@@ -309,6 +329,6 @@ def test_gradients_of_laws_stay_finite_at_the_limits():
     jacobians = finite_jacobians(laws, gains, half_lives, 1 / 60, 30.0)
     assert_allclose(jacobians[-1, 0], 0, atol=0)
     finite_jacobians(springs, 3.0, 2.0, 1.0, half_lives, 1 / 60)
-    for gap in (0.0, 1e-4):
+    for gap in (0.0, 1e-6):
         finite_jacobians(clamped_speeds, np.array([0.0, 60.0, 1e-9]), 1 / 60, gap)
     finite_jacobian(smoothing.half_life_of_gain, 1.0, 30.0)

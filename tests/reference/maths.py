@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 DIRECTIONLESS = 1e-9  # length of a vector, in its own unit, that has no direction
-JUMP = 1e-4  # m, below which the clamped-speed law closes a gap at once
+JUMP = 1e-6  # m, below which the clamped-speed law closes a gap at once
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 X, Y, Z = np.eye(3)
 
