@@ -135,7 +135,8 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
 def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """Unreal's foot IK control rig, with its latch.
 
-    It works only while the character stands still (`contact.idle_speed`). As in the original, the
+    It works only while the character stands still: slower than `contact.idle_speed`, which is above
+    0 because a captured character sways. As in the original, the
     latch stops all movement once the feet have arrived, which can freeze the pelvis short of its
     goal; better switch `effector.latch` off.
 
@@ -143,13 +144,14 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     `probe.ray_up`, and `pelvis.half_height` is what shrinks.
 
     Args:
-        faithful: leave it to the game to keep the capsule on the ground.
+        faithful: leave it to the game to keep the capsule on the ground, and take any speed above 0
+            for motion, as the original does.
     """
     ik = FootIK(
         root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
         probe=RootProbe(limited=not faithful),
-        contact=IdleContact(),
+        contact=IdleContact() if faithful else IdleContact(idle_speed=0.1),
         target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
         lean=NoLean(),
         lock=NoLock(),

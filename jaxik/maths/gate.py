@@ -79,7 +79,7 @@ class Smooth(AbstractGate):
         # An infinite threshold decides outright; divided by the width, it would leave softness
         # without a gradient.
         gap = threshold - x
-        infinite = jnp.isinf(gap)
+        infinite = ~jnp.isfinite(gap)
         weight = jax.nn.sigmoid(jnp.where(infinite, 0.0, gap) / (band * self.softness))
         return jnp.where(infinite, jnp.where(gap > 0, 1.0, 0.0), weight)
 
@@ -89,7 +89,7 @@ class Smooth(AbstractGate):
     def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
         # An infinite limit does not bind; left in the formula, it would give inf - inf.
         width = band * self.softness
-        no_low, no_high = jnp.isinf(low), jnp.isinf(high)
+        no_low, no_high = ~jnp.isfinite(low), ~jnp.isfinite(high)
         floor, ceiling = jnp.where(no_low, 0.0, low), jnp.where(no_high, 0.0, high)
         raised = jnp.where(no_low, x, floor + width * jax.nn.softplus((x - floor) / width))
         excess = jnp.where(no_high, 0.0, width * jax.nn.softplus((x - ceiling) / width))

@@ -89,8 +89,8 @@ def step_of_time(time: Array, dt: Array) -> Array:
 
 def step_of_speed(speed: Array, dt: Array) -> Array:
     """Step in `dt` s of a weight that moves by `speed` per second; 1 at an infinite speed."""
-    infinite = jnp.isinf(speed)
-    return jnp.where(infinite, 1.0, jnp.where(infinite, 0.0, speed) * dt)
+    finite = jnp.isfinite(speed)
+    return jnp.where(finite, jnp.where(finite, speed, 0.0) * dt, 1.0)
 
 
 def spring(before: Motion, goal: Array, half_life: Array, dt: Array) -> Motion:

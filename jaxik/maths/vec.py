@@ -131,8 +131,8 @@ def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def safe_divide(
     numerator: Float[Array, "*a"], denominator: Float[Array, "*b"], otherwise: float = 0.0
 ) -> Array:
-    """Quotient; `otherwise`, with zero gradient, where the denominator is zero."""
-    nonzero = denominator != 0
+    """Quotient; `otherwise`, with zero gradient, where the denominator is almost 0."""
+    nonzero = jnp.abs(denominator) >= jnp.finfo(denominator.dtype).tiny
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), otherwise)
 
 

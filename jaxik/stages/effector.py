@@ -253,7 +253,7 @@ class BodyEffector(AbstractEffector):
         height = smoothing.lerp(state.height, goal, fraction)
 
         near = now.gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
-        arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
+        arrived = jnp.prod(1.0 - sensed.counted * (1.0 - near))
         may_sleep = jnp.where(self.latch, self._stands(now), 0.0)
         asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
@@ -264,7 +264,7 @@ class BodyEffector(AbstractEffector):
     def _stands(self, now: SensedMoment) -> Float[Array, ""]:
         """1 while all feet with foot IK stand."""
         sensed = now.sensed
-        standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
+        standing = 1.0 - sensed.counted * (1.0 - sensed.contact.planted)
         return now.gate.minimum(standing, band=0.1)
 
 

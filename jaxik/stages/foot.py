@@ -18,7 +18,7 @@ from jaxik.world.terrain import Hit
 
 from .effector import Effector
 from .inputs import Inputs
-from .leg import SolvedLeg
+from .leg import SolvedLeg, is_full
 from .probe import foot_heading
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
@@ -114,7 +114,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
-        side = jnp.where(rig.side == 0, 1.0, rig.side)
+        side = jnp.where(jnp.abs(rig.side) < 0.5, 1.0, rig.side)
         outer = vec.scale(left, side)
         ahead = vec.across(sole, up, sensed.slope.forward_ws)
         right = vec.cross(ahead, up)
@@ -177,8 +177,8 @@ class AimFoot(AbstractAnimatedFoot):
         )
         weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
         aim_rot = quat.nlerp(quat.identity(aim_rot.dtype), aim_rot, weight * self.weight)
-        full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)
-        return with_ankle(frame, leg, quat.multiply(aim_rot, carried.rot), reached * full)
+        turned = quat.multiply(aim_rot, carried.rot)
+        return with_ankle(frame, leg, turned, reached * is_full(weight * self.weight))
 
 
 class FlatFoot(AbstractFoot):
@@ -225,8 +225,7 @@ def turn_feet(
     """The legs with ankle rotations `rot_ws`, world space, each by its weight of foot IK."""
     rot_ms = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
     rot = quat.nlerp(leg.pose.ankle.rot, rot_ms, effector.weight)
-    full = jnp.where(effector.weight >= 1, 1.0, 0.0)
-    return with_ankle(frame, leg, rot, reached * full)
+    return with_ankle(frame, leg, rot, reached * is_full(effector.weight))
 
 
 def with_ankle(frame: Frame, leg: SolvedLeg, rot: Array, reached: Array) -> SolvedFoot:

@@ -22,6 +22,8 @@ from jaxik.world.skeleton import LegPose, Rig, Transform
 
 from .inputs import Inputs
 
+FULL = 0.999  # weight of a leg from which it gets foot IK in full
+
 
 @struct
 class SolvedLeg:
@@ -190,6 +192,11 @@ class HintLeg(AbstractLeg):
         return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
 
 
+def is_full(weight: Array) -> Array:
+    """1 where so much foot IK brings a leg to its goal, else 0."""
+    return jnp.where(weight > FULL, 1.0, 0.0)
+
+
 def limb_of(rig: Rig, pose: LegPose) -> Limb:
     """The legs as limbs, model space."""
     to_hip = vec.subtract(pose.hip.pos, pose.knee.pos)
@@ -231,5 +238,5 @@ def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
         solved,
         local_correction(pose.hip.rot, swing),
         quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),
-        bend.reached * jnp.where(weight >= 1, 1.0, 0.0),
+        bend.reached * is_full(weight),
     )

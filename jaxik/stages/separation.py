@@ -108,7 +108,7 @@ class FootSeparation(AbstractSeparation):
         missing = wanted - _apart(placed, placed + kept, side)
         zero = jnp.zeros_like(missing)
         missing = now.gate.clip(missing, zero, zero + jnp.inf, band=DISTANCE_BAND)
-        active = jnp.where(sensed.weight > 0, 1.0, 0.0)
+        active = sensed.counted
         free = active * (1.0 - held)
         share = vec.safe_divide(free[:, None], free[:, None] + free[None, :])
         opposed = jnp.where(side[:, None] * side[None, :] < 0, active[None, :], 0.0)

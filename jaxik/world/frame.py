@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from jaxik.maths import quat, vec
+from jaxik.maths.smoothing import clip_to_one
 from jaxik.maths.struct import place, struct
 
 from .skeleton import LegPose, Rig, Still, Transform
@@ -13,6 +14,7 @@ from .terrain import Hit
 
 FORWARD = (0.0, 0.0, 1.0)  # model space
 UP = (0.0, 1.0, 0.0)  # model space
+COUNTS = 0.1  # weight, of a leg or of all, from which it counts in full for what moves the body
 
 
 @struct
@@ -248,6 +250,11 @@ class Sensed:
     """m, by which scaled strides move ankles and balls, which have moved already; None for none."""
 
     @property
+    def counted(self) -> Float[Array, " legs"]:
+        """0..1, how far each leg counts for what moves the body, whatever its weight is then."""
+        return counted(self.weight)
+
+    @property
     def unscaled_ankle_ws(self) -> Float[Array, "legs 3"]:
         """m, the animated ankles before strides are scaled."""
         return self.ankle_ws if self.warp_ws is None else self.ankle_ws - self.warp_ws
@@ -262,6 +269,11 @@ class Sensed:
         """0..1, how far each foot turns to the ground under it."""
         standing = self.contact.weight
         return self.ground.ankle.found * (standing + self.ground.swing * (1.0 - standing))
+
+
+def counted(weight: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """0..1, how far what has this weight counts: nothing changes as soon as there is some."""
+    return clip_to_one(weight / COUNTS)
 
 
 def rise_of(

@@ -65,7 +65,8 @@ class Plane(AbstractSurface):
         # A ray that starts on the plane hits it, however the difference is rounded.
         parts = (vec.dot(jnp.abs(x), jnp.abs(self.normal_ws)) for x in (origins_ws, self.point_ws))
         tolerance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(sum(parts))
-        hit = (rise != 0) & (distance * jnp.abs(rise) >= -tolerance) & (self.layers & mask != 0)
+        steepness = jnp.abs(rise)
+        hit = (steepness > 0) & (distance * steepness >= -tolerance) & (self.layers & mask != 0)
         normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)
         return distance, jnp.broadcast_to(normal, (*distance.shape, 3)), hit
 

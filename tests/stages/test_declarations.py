@@ -107,9 +107,9 @@ ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no;
 ozz!: StandingContact; GroundRoot half_life=0; StrideWarp;
   FootProbe limited=no ray_down=inf use_toe=no; SoleTarget; NoLean; NoLock; NoSeparation;
   LowestPelvis limit=inf on_gain=1 off_gain=1; FoundEffector; PoleLeg; AimFoot; NoFade
-unreal: IdleContact; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean; NoLock; NoSeparation;
-  CapsulePelvis; BodyEffector latch=yes; TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1;
-  KeepFoot; SpeedFade
+unreal: IdleContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean; NoLock;
+  NoSeparation; CapsulePelvis; BodyEffector latch=yes;
+  TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade
 unreal!: IdleContact; GroundRoot enabled=no; StrideWarp; RootProbe limited=no; RootTarget; NoLean;
   NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade

@@ -125,6 +125,7 @@ def by_speed() -> jaxik.FootIK:
 SYSTEMS = {  # for `to_ik`, beside the presets
     "by speed": by_speed,
     "record": functools.partial(jaxik.presets.record, faithful=True),
+    "unreal": functools.partial(jaxik.presets.unreal, faithful=True),
     "mec": functools.partial(jaxik.presets.mec, faithful=True),
     "record as it comes": jaxik.presets.record,
     "mec as it comes": jaxik.presets.mec,

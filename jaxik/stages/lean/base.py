@@ -10,7 +10,7 @@ from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs, SensedMoment
-from jaxik.world.frame import Contact, GroundHits, Slope, heading
+from jaxik.world.frame import Contact, GroundHits, Slope, counted, heading
 from jaxik.world.skeleton import Rig
 
 
@@ -88,9 +88,14 @@ def standing_slope(inputs: Inputs, ground: GroundHits, contact: Contact, weight:
     """The slope of the mean normal under the standing feet; level where none stands."""
     up_ws = inputs.terrain.up_ws
     forward_ws, right_ws = heading(inputs.frame.world_from_model, up_ws)
-    standing = contact.weight * ground.ankle.found * weight
+    stands = jnp.where(inputs.rig.present, contact.weight * ground.ankle.found, 0.0)
+    standing = stands * weight
     normal = vec.sum_vectors(vec.scale(ground.ankle.normal, standing))
-    normal = jnp.where(vec.sum_last(standing) > 0, normal, up_ws)
+    total = vec.sum_last(standing)
+    normal = jnp.where(total > 0, normal, up_ws)
+    # Not as soon as a leg that stands has any weight at all.
+    level = 1.0 - counted(vec.safe_divide(total, vec.sum_last(stands)))
+    normal += vec.scale(up_ws - normal, level)
     up = vec.dot(normal, up_ws)
     return Slope(
         vec.safe_arctan2(-vec.dot(normal, forward_ws), up),

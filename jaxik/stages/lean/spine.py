@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
-from jaxik.world.frame import Contact, GroundHits, Slope
+from jaxik.world.frame import Contact, GroundHits, Slope, counted
 from jaxik.world.skeleton import Rig
 
 from .base import (
@@ -122,7 +122,10 @@ class SpineLean(AbstractLean):
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         soles = standing_slope(inputs, ground, contact, weight)
+        standing = vec.sum_last(contact.weight * ground.ankle.found * weight)
+        sure = counted(standing)
         weight = weight * ground.ankle.found
+        known = counted(vec.sum_last(weight))
         weight = vec.safe_divide(weight, vec.sum_last(weight))
         points = ground.ankle.point - inputs.frame.world_from_model.pos
         height = self._about_mean(points, inputs.terrain.up_ws, weight)
@@ -130,8 +133,9 @@ class SpineLean(AbstractLean):
         def between_feet(along_ws: Array, slope: Array) -> Array:
             place = self._about_mean(points, along_ws, weight)
             variance, covariance = (vec.sum_last(weight * place * x) for x in (place, height))
+            variance, covariance = known * variance, known * covariance
             prior = (0.5 * self.spacing) ** 2
-            cos, sin = vec.cos_sin(slope)
+            cos, sin = vec.cos_sin(sure * slope)
             return vec.safe_arctan2(covariance * cos + prior * sin, (variance + prior) * cos)
 
         forward = between_feet(soles.forward_ws, soles.forward)

@@ -10,6 +10,8 @@ from jaxik.maths.struct import struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.skeleton import Rig
 
+LEAST = 0.01  # weight of a leg, up to which its foot is not locked
+
 
 @struct
 class Hold:

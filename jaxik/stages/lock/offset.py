@@ -10,7 +10,7 @@ from jaxik.stages.inputs import SensedMoment
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
 
-from .base import AbstractLock, Hold
+from .base import LEAST, AbstractLock, Hold
 
 DISTANCE_BAND = 0.01  # m
 COSINE_BAND = 0.03  # about 2 degrees at a right angle
@@ -237,7 +237,7 @@ class OffsetLock(AbstractLock):
         lengths = vec.length(leg) * vec.length(animated)
         alignment = vec.safe_divide(vec.dot(leg, animated), lengths, otherwise=1.0)
         aligned = gate.above(alignment, jnp.cos(self.release_cone), band=COSINE_BAND)
-        enabled = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
+        enabled = jnp.where(self.enabled & (sensed.weight > LEAST), 1.0, 0.0)
         return not_folded * not_straight * aligned * enabled * (1.0 - sensed.contact.lifted)
 
     def _follows_animation(

@@ -10,7 +10,7 @@ from jaxik.stages.inputs import SensedMoment
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import cast
 
-from .base import AbstractLock, Hold
+from .base import LEAST, AbstractLock, Hold
 
 
 @struct
@@ -77,7 +77,7 @@ class PlantLock(AbstractLock):
 
         contact = sensed.contact
         stands = gate.choose(before, 1.0 - contact.lifted, contact.planted)
-        plants = self.plant & (sensed.weight > 0)
+        plants = self.plant & (sensed.weight > LEAST)
         locked = jnp.where(plants, sensed.foothold.found * stands, 0.0)
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         weight = smoothing.move_towards(state.weight, self.plant_weight, step)

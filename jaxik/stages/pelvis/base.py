@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
+from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import SensedMoment
@@ -16,6 +17,7 @@ from jaxik.world.skeleton import Rig, Transform
 
 HEIGHT_BAND = 0.01  # m
 FAR = 1e6  # m, beyond any leg
+AWAY = 5.0  # m, by which the request of a leg that hardly counts is out of the way of others
 
 
 @struct
@@ -78,8 +80,30 @@ class AbstractPelvis(Rule):
 
 
 def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
-    """Mean of requested heights, m, weighted by foot IK of each leg; 0 if all weights are 0."""
-    return vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
+    """Mean of requested heights, m, weighted by foot IK of each leg; 0 if no leg counts."""
+    mean = vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
+    return mean * greatest_count(sensed)
+
+
+def greatest_count(sensed: Sensed) -> Float[Array, ""]:
+    """0..1, how far the leg counts that counts most."""
+    return HARD.maximum(sensed.counted, band=0.0)
+
+
+def lifted_out(sensed: Sensed, heights: Array) -> Float[Array, " legs"]:
+    """Heights, m, those of legs that do not count so high that they are no minimum of all."""
+    away = heights + AWAY * (1.0 - sensed.counted)
+    return jnp.where(sensed.weight > 0, away, FAR)
+
+
+def lowest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
+    """The lowest of the heights of legs that count, m; `FAR` if none does."""
+    return gate.minimum(lifted_out(sensed, heights), band=HEIGHT_BAND)
+
+
+def highest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
+    """The highest of the heights of legs that count, m; `-FAR` if none does."""
+    return -lowest_of(gate, sensed, -heights)
 
 
 def rise_to_length(

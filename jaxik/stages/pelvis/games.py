@@ -21,6 +21,9 @@ from .base import (
     AbstractPelvis,
     PelvisMoment,
     PelvisState,
+    highest_of,
+    lifted_out,
+    lowest_of,
     requested_heights,
     rise_to_length,
 )
@@ -59,11 +62,10 @@ class LowestPelvis(AbstractPelvis):
         sensed, gate = now.sensed, now.gate
         requested = requested_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
-        active = sensed.weight > 0
-        highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
-        of_standing = jnp.where(active, smoothing.lerp(highest, requested, weight), highest)
+        highest = highest_of(gate, sensed, requested)
+        of_standing = smoothing.lerp(highest, requested, weight)
         lowest = gate.minimum(of_standing, band=HEIGHT_BAND)
-        of_all = gate.minimum(jnp.where(active, requested, FAR), band=HEIGHT_BAND)
+        of_all = lowest_of(gate, sensed, requested)
         zero = jnp.zeros_like(lowest)
         rise = gate.clip(of_all, zero, zero + jnp.inf, band=HEIGHT_BAND)
         waiting = gate.clip(lowest, zero - jnp.inf, rise, band=HEIGHT_BAND)
@@ -105,7 +107,7 @@ class CapsulePelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        requested = jnp.where(sensed.weight > 0, requested_heights(sensed, target.pos), 0.0)
+        requested = sensed.counted * requested_heights(sensed, target.pos)
         lowest = gate.minimum(requested, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
@@ -168,11 +170,12 @@ class LegLengthPelvis(AbstractPelvis):
         sensed, gate = now.sensed, now.gate
         lowest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.min_length)
         highest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.max_length)
-        active = (sensed.foothold.found > 0) & (sensed.weight > 0)
+        found = sensed.foothold.found > 0
         zero = jnp.zeros_like(lowest[:1])
-        floors = jnp.concatenate([jnp.where(active, lowest, -FAR), zero])
-        floor = gate.maximum(floors, band=HEIGHT_BAND)
-        ceilings = jnp.concatenate([jnp.where(active, highest, FAR), floor[None]])
+        floors = jnp.where(found, lifted_out(sensed, -lowest), FAR)
+        floor = -gate.minimum(jnp.concatenate([floors, zero]), band=HEIGHT_BAND)
+        ceilings = jnp.where(found, lifted_out(sensed, highest), FAR)
+        ceilings = jnp.concatenate([ceilings, floor[None]])
         goal = jnp.where(self.enabled, gate.minimum(ceilings, band=HEIGHT_BAND), 0.0)
 
         fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)

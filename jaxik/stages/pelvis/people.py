@@ -16,14 +16,18 @@ from jaxik.maths.parameter_tree import (
     switch,
 )
 from jaxik.maths.struct import struct
+from jaxik.world.frame import counted
 from jaxik.world.skeleton import Transform, mean_position
 
 from .base import (
-    FAR,
     HEIGHT_BAND,
     AbstractPelvis,
     PelvisMoment,
     PelvisState,
+    greatest_count,
+    highest_of,
+    lifted_out,
+    lowest_of,
     mean_height,
     rise_to_length,
     supported_heights,
@@ -110,11 +114,11 @@ class SupportPelvis(AbstractFollowingPelvis):
         requested = supported_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         total = vec.sum_last(weight)
-        active = sensed.weight > 0
-        lowest = gate.minimum(jnp.where(active, requested, FAR), band=HEIGHT_BAND)
+        lowest = lowest_of(gate, sensed, requested)
         support = vec.safe_divide(vec.sum_last(weight * requested), total)
         height = smoothing.lerp(support, lowest, self.lowest_share)
-        return Goal(jnp.where(total > 0, height, resting), jnp.zeros_like(resting))
+        height = smoothing.lerp(resting, height, counted(total))
+        return Goal(height, jnp.zeros_like(resting))
 
 
 class ReachPelvis(AbstractFollowingPelvis):
@@ -176,22 +180,20 @@ class ReachPelvis(AbstractFollowingPelvis):
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
-        active = sensed.weight > 0
-        mean = mean_height(sensed, requested)
-        highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
-        highest = jnp.where(jnp.any(active), highest, mean)
+        count, mean = greatest_count(sensed), mean_height(sensed, requested)
+        highest = count * highest_of(gate, sensed, requested)
         wanted = smoothing.lerp(mean, highest, self.highest_share)
         longest = self.extension * (sensed.thigh + sensed.shin)
         forward_ws, hip_ws = sensed.slope.forward_ws, _tilted_hips(now)
 
         def heights(hip_ws: Array, ankle_ws: Array) -> Array:
-            return jnp.where(active, rise_to_length(sensed, hip_ws, ankle_ws, longest), FAR)
+            return lifted_out(sensed, rise_to_length(sensed, hip_ws, ankle_ws, longest))
 
         def limiting_ahead(hip_ws: Array, ankle_ws: Array) -> Array:
             """How far ahead of its hip the foot is whose leg limits the height, m."""
             limits = jax.nn.softmax(-heights(hip_ws, ankle_ws) / self.softness)
             reach = limits * vec.dot(ankle_ws - hip_ws, forward_ws)
-            return vec.sum_last(jnp.where(active, reach, 0.0))
+            return count * vec.sum_last(reach)
 
         def reachable_height(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
             limits = jnp.concatenate([heights(hip_ws, ankle_ws), wanted[None]])

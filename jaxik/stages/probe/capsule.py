@@ -78,7 +78,7 @@ class SweepProbe(AbstractLimitedProbe):
         facing = jnp.where(facing > STEEPEST, facing, STEEPEST)
         drop = vec.dot(away, up) + vec.dot(vec.reject(away, up), rest.normal) / facing
         drop = jnp.where(drop < rest.distance, rest.distance, drop)  # not above its underside
-        first = (rest.found > 0) & ((ray.found == 0) | (drop <= ray.distance))
+        first = (rest.found > 0) & ((ray.found <= 0) | (drop <= ray.distance))
         distance = jnp.where(first, drop, ray.distance)
         platform = None
         if ray.platform is not None and rest.platform is not None:

@@ -162,7 +162,7 @@ class StrideProbe(AbstractSupportedProbe):
         ball = inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
         way = vec.reject(stride.next_ws - ball, level.up_ws)
         aside = vec.cross(way, level.up_ws)
-        spread = jnp.where(stride.known > 0, 0.0, SPREAD)
+        spread = jnp.where(stride.known > 0.5, 0.0, SPREAD)
         ways = jnp.stack([jnp.zeros_like(way), way, -way, aside, -aside])
         places_ws = stride.next_ws + vec.scale(ways, spread)
         grounds = jax.vmap(
@@ -230,7 +230,7 @@ class StrideProbe(AbstractSupportedProbe):
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
         platform = last.platform
         if platform is not None:
-            arriving = (last.found == 0) | (trust * fraction > 0.5)
+            arriving = (last.found <= 0) | (trust * fraction > 0.5)
             platform = jnp.where(arriving, next_.platform, platform)
         hit = Hit(ankle_ws, normal, self.ray_up - height, found, platform)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
@@ -255,7 +255,7 @@ class StrideProbe(AbstractSupportedProbe):
         self, labelled: Stride, last_ws: Array, next_ws: Array, fraction: Array, up_ws: Array
     ) -> Stride:
         """The stride of the animation where it is known and wanted, else the one that is given."""
-        known = (labelled.known > 0) & self.use_strides
+        known = (labelled.known > 0.5) & self.use_strides
         aside_ws = labelled.aside_ws
         if aside_ws is not None:
             aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, up_ws), 0.0)

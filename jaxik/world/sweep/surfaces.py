@@ -102,7 +102,7 @@ def _on_plane(
         over -= jnp.abs(along)
         touching -= vec.scale(shapes.half_ws, jnp.sign(along))
     drop = vec.safe_divide(over, jnp.abs(rise))
-    met = (rise != 0) & (over >= -_rounding(shapes)) & (plane.layers & mask != 0)
+    met = (jnp.abs(rise) > 0) & (over >= -_rounding(shapes)) & (plane.layers & mask != 0)
     contact = shapes.centre_ws - vec.scale(up_ws, drop) + touching
     return drop, jnp.broadcast_to(normal, contact.shape), contact, met
 

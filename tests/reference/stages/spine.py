@@ -14,6 +14,7 @@ DEFAULTS = (
     | named("lean", forward_rate_slide=0.0, side_rate_slide=0.0)
     | named("lean", pelvis_rate=-0.25, pelvis_side_rate=0.0, spacing=0.3, half_life=0.2)
 )
+COUNTS = 0.1  # weight of all legs together from which their slope is taken in full
 
 
 @dataclass
@@ -62,7 +63,8 @@ def lean(
             parameters["lean.spacing"],
             points @ along_ws,
             points @ up,
-            math.atan2(-float(normal @ along_ws), float(normal @ up)),
+            min(weights.sum() / COUNTS, 1.0)
+            * math.atan2(-float(normal @ along_ws), float(normal @ up)),
             legs,
         )
         for along_ws in (ahead_ws, right_ws)
@@ -95,7 +97,8 @@ def between_feet(
         return under_soles
     shares = legs / legs.sum()
     places, heights = places - shares @ places, heights - shares @ heights
-    rows = np.append(np.sqrt(shares) * places, spacing / 2)
-    goals = np.append(np.sqrt(shares) * heights, spacing / 2 * math.tan(under_soles))
+    counted = np.sqrt(min(legs.sum() / COUNTS, 1.0) * shares)
+    rows = np.append(counted * places, spacing / 2)
+    goals = np.append(counted * heights, spacing / 2 * math.tan(under_soles))
     (tangent,), *_ = np.linalg.lstsq(rows[:, None], goals, rcond=None)
     return math.atan(tangent)

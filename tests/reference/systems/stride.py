@@ -196,13 +196,15 @@ def support_goal(
     """Between the heights that the standing feet and the lowest foot request."""
     leg_weights = [foot.weight for foot in feet]
     weights = [foot.grounded * foot.weight for foot in feet]
+    resting = float(np.average(requested, weights=leg_weights)) if any(leg_weights) else 0.0
+    if state is not None:
+        resting = state.pelvis_goal
     if sum(weights) == 0.0:
-        if state is not None:
-            return state.pelvis_goal
-        return float(np.average(requested, weights=leg_weights)) if any(leg_weights) else 0.0
+        return resting
     support = float(np.average(requested, weights=weights))
     lowest = min(gap for gap, w in zip(requested, leg_weights, strict=True) if w > 0.0)
-    return support + parameters["pelvis.lowest_share"] * (lowest - support)
+    goal = support + parameters["pelvis.lowest_share"] * (lowest - support)
+    return lerp(resting, goal, min(sum(weights) / spine.COUNTS, 1.0))
 
 
 def reach_goal(

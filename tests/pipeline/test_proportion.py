@@ -1,0 +1,108 @@
+"""What comes out moves in proportion to what goes in: equal floats decide nothing."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from support import clips
+from support.cases import QUICK, stacked
+from support.clips import BROKEN, to_frames, to_rig, to_terrain
+
+FRAMES = 90
+JITTER, LARGEST = 1e-7, 1e-5  # of each number that goes in; m, of what comes out
+FRACTIONS = ("weight", "grounded", "slide", "standing", "fraction", "known")
+SIZES = ("foot_speed", "toe_speed")
+PRESETS = ("record", "ozz", "unreal", "mec", "stride")
+RNG = np.random.default_rng(5)
+
+
+def wandering() -> jaxik.Frame:
+    """Walks and stands, with speeds, slides and footholds of all kinds."""
+    rig = clips.make_rig()
+    return to_frames(clips.wandering(rig, np.random.default_rng(3), FRAMES, stand=(0.3, 0.45)))
+
+
+def at_the_ends(frames: jaxik.Frame) -> Iterator[jaxik.Frame]:
+    """The clip with weights that are 0 or 1: of one leg, of none, of the character in the air."""
+    number, ones = np.arange(FRAMES)[:, None], np.ones((FRAMES, 2))
+    whole = dataclasses.replace(frames, grounded=jnp.ones(FRAMES), slide=jnp.zeros(FRAMES))
+    weights = (ones, 0.0 * ones, (number // 30 + np.arange(2)) % 2 * ones)
+    yield from (dataclasses.replace(whole, weight=jnp.asarray(weight)) for weight in weights)
+    in_air = number[:, 0] // 15 % 2
+    yield dataclasses.replace(whole, weight=jnp.asarray(ones), grounded=jnp.asarray(1.0 * in_air))
+
+
+def jittered(frames: jaxik.Frame) -> jaxik.Frame:
+    """Each float off by up to `JITTER`, but still in its range."""
+
+    def jitter(path: Any, leaf: jax.Array) -> jax.Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        name = path[-1].name
+        numbers = np.asarray(leaf) + RNG.uniform(-JITTER, JITTER, leaf.shape)
+        if name == "rot":
+            numbers /= np.linalg.norm(numbers, axis=-1, keepdims=True)
+        if name in (*FRACTIONS, *SIZES):
+            numbers = np.clip(numbers, 0.0, 1.0 if name in FRACTIONS else np.inf)
+        return jnp.asarray(numbers)
+
+    return jax.tree_util.tree_map_with_path(jitter, frames)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_jitter_of_all_that_goes_in_moves_nothing_by_more_than_its_share(preset: str):
+    ik, rig, ground = (
+        getattr(jaxik.presets, preset)(),
+        to_rig(clips.make_rig()),
+        to_terrain(BROKEN),
+    )
+    frames = wandering()
+    rows = [frames, *at_the_ends(frames)]
+    run = jax.jit(
+        jax.vmap(lambda frames: jaxik.run(ik, rig, ground, frames)), compiler_options=QUICK
+    )
+    result = run(stacked([*rows, *map(jittered, rows)]))
+    for joint in ("hip", "knee", "ankle", "toe"):
+        places = np.asarray(getattr(result.pose, joint).pos)
+        apart = np.abs(places[len(rows) :] - places[: len(rows)]).max(axis=(2, 3))
+        assert apart.max() < LARGEST, (joint, apart.max(axis=1), apart.argmax(axis=1))
+    reached = np.asarray(result.reached)
+    assert np.array_equal(reached[: len(rows)], reached[len(rows) :])
+
+
+# No comparison asks whether floats are equal.
+
+
+def equations(program: Any) -> Iterator[Any]:
+    for equation in program.eqns:
+        yield equation
+        for inner in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+        ):
+            if hasattr(inner, "eqns"):
+                yield from equations(getattr(inner, "jaxpr", inner))
+
+
+def float_equalities(function: Any, *inputs: Any) -> list[str]:
+    """Where a program compares floats by `==` or `!=`, other than for NaN."""
+    return [
+        str(equation.source_info.traceback)
+        for equation in equations(jax.make_jaxpr(function)(*inputs).jaxpr)
+        if equation.primitive.name in ("eq", "ne")
+        and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating)
+        and equation.invars[0] is not equation.invars[1]
+    ]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("gate", [jaxik.HARD, jaxik.Smooth(1.0)], ids=["hard", "smooth"])
+def test_no_program_asks_whether_floats_are_equal(preset: str, gate: Any):
+    ik, rig, ground = getattr(jaxik.presets, preset)(), to_rig(clips.make_rig()), to_terrain(BROKEN)
+    assert not float_equalities(jaxik.run, ik, rig, ground, wandering(), gate)
+    assert float_equalities(lambda x: jnp.where(x == 0, 1.0, x), 0.5), "the check notices them"
