@@ -1,0 +1,1 @@
+"""Random staircases: `PYTHONPATH=tests python -m stairs`."""
