@@ -18,7 +18,8 @@ from .pelvis import PelvisState, requested_heights
 HEIGHT_BAND = 0.01  # m
 ANGLE_BAND = 0.035  # rad, 2 degrees
 # Sine of the angle by which a leg points ahead, up to which its heel rises and from which it stays.
-RISES, STAYS = 0.2, 0.4
+RISES, STAYS = 0.0, 0.3
+SHORTENS = 0.3  # of the most that a rising heel can shorten a leg, from which it counts in full
 
 
 @struct
@@ -162,8 +163,8 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
 
     It turns `arm` about `axis`, toes down, so that `to_ball + arm` has the length `length`. It is
     negative if the leg is shorter already. If the leg cannot become so short, it is the angle that
-    comes nearest; if rising would only lengthen the leg, it is 0. The squared length is
-    `c + P cos + Q sin` of the angle.
+    comes nearest. The less a first small rise shortens the leg, the smaller the angle; where it
+    would lengthen it, it is 0. The squared length is `c + P cos + Q sin` of the angle.
 
     Args:
         to_ball: from hip to ball, m.
@@ -185,7 +186,7 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
     safe = jnp.where(inside, cosine, 0.0)
     angle = jnp.where(inside, vec.safe_arctan2(vec.safe_sqrt(1.0 - safe**2), safe), limit)
     phase = vec.safe_arctan2(jnp.where(shortens, sin_part, -1.0), cos_part)
-    return jnp.where(shortens, angle + phase, 0.0)
+    return (angle + phase) * smoothing.smoothstep(-vec.safe_divide(sin_part, size) / SHORTENS)
 
 
 @struct

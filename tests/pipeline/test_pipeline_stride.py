@@ -25,7 +25,7 @@ ODD: dict[str, Any] = (  # away from the defaults
     LOCKS
     | named("probe", ray_up=0.7, ray_down=0.11, rise_start=0.1, rise_end=0.8, steepness=2.7)
     | named("probe", max_step_up=0.16, max_step_down=0.14, max_slope=0.1, clearance=0.05)
-    | named("probe", way_slope=0.7, heel_length=0.1, ball_height=0.04, toe_length=0.06)
+    | named("probe", heel_length=0.1, ball_height=0.04, toe_length=0.06)
     | named("probe", held_lift=0.4, toe_clearance=0.05, lift_per_rise=0.3, lift_per_fall=0.6)
     | named("probe", lift_over=1.2, toes_up=0.2, toes_down=0.1, toes_down_per_height=1.4)
     | named("probe", toes_first=1.1, min_sole=0.9, max_slide=0.06)

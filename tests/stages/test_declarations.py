@@ -71,7 +71,7 @@ CornerProbe: foot_length m 0.2 0.02 0.5; half_width m 0.05 0.01 0.2; extra m 0.2
 FootProbe: toe_ls m 0,-0.07,0.2 -0.4 0.4
 RootProbe: ray_up m 0.9 0 2; ray_down m 0.5 0 2
 StrideProbe: ray_up m 1 0 2; ray_down m 1 0 2; rise_start 1 0 0 0.45; rise_end 1 1 0.55 1;
-  steepness 1 1.875 1 4; clearance m 0 -0.1 0.1; way_slope 1 1.5 0.2 5; heel_length m 0.07 0 0.2;
+  steepness 1 1.875 1 4; clearance m 0 -0.1 0.1; heel_length m 0.07 0 0.2;
   toe_length m 0.04 0 0.2; ball_height m 0.055 0 0.15; held_lift 1 0.6 0 1;
   toe_clearance m 0.03 0 0.15; lift_per_rise 1 0.5 0 1.5; lift_per_fall 1 0.35 0 1.5;
   lift_over 1 1.7 0 3; toes_up rad 0.1 0 0.6; toes_down rad 0.3 0 0.8;

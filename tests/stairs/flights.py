@@ -80,9 +80,10 @@ class Flight:
         return np.interp(z, apart, points[:, 1])
 
     def clearances(self, points_ws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Heights of points over the lowest and over the highest ground that they may touch, m."""
+        """How far points are above the ground and in it, m; both within `TOUCH` of an edge."""
         near = [self.heights(points_ws[..., 2] + away) for away in (-TOUCH, 0.0, TOUCH)]
-        return points_ws[..., 1] - np.min(near, 0), points_ws[..., 1] - np.max(near, 0)
+        height = points_ws[..., 1]
+        return np.maximum(height - np.max(near, 0), 0.0), np.maximum(np.min(near, 0) - height, 0.0)
 
     def quads(self) -> Float64[np.ndarray, "quads 2 2"]:
         """Both ends of each strip of the mesh: z and height, m."""

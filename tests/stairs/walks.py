@@ -24,9 +24,9 @@ from stairs.flights import Flight
 
 FPS, FRAMES = 60, 200
 SECONDS = 9.0
-STEP_LENGTHS = (0.35, 0.45, 0.55, 0.65)  # m
+STEP_LENGTHS = (0.25, 0.35, 0.45, 0.55, 0.65)  # m
 STEP_SECONDS, STANCE = 0.55, 0.62  # s, and part of two steps
-HIGHEST = 0.42  # m, rise of one step of a walk
+HIGHEST = 0.32  # m, rise of one step of a walk: two stairs
 CHUNK = 10  # flights that are walked at once
 SETTLED = 20  # frames before and after which nothing is measured
 
@@ -174,8 +174,8 @@ def judge(flight: Flight, level: jaxik.Frame, solved: Solved) -> Verdict:
     """What is wrong with a walk over a flight; see `Verdict`."""
     part = slice(SETTLED, FRAMES - SETTLED)
     standing = np.asarray(level.stride.standing) > 0
-    over, inside = flight.clearances(np.asarray(solved.soles))
-    above, sunk = over.min(-1), -inside.min(-1)
+    above, sunk = flight.clearances(np.asarray(solved.soles))
+    above, sunk = above.min(-1), sunk.max(-1)
     off = np.maximum(above, sunk)[part][standing[part]].max(initial=0.0)
 
     animated = np.asarray(

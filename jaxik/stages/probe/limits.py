@@ -115,7 +115,7 @@ class AbstractLimitedProbe(AbstractProbe):
         starts = jnp.stack([starts_ws, starts_ws - vec.scale(up, above)])
         reaches = jnp.stack([reach + jnp.zeros_like(above), reach - above])
         hits = self.find(inputs, starts, reaches, layers)
-        accepted = hits.found * self._trust_from(root, hits, up, margin)
+        accepted = hits.found * self.trust_from(root, hits, up, margin)
         if self.check_support and stood_on:
             accepted *= self._trust_of_width(inputs, starts, reaches, hits, layers)
         first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
@@ -162,8 +162,10 @@ class AbstractLimitedProbe(AbstractProbe):
         """
         return climb(normal, way, up_ws) * self.gentleness(normal, up_ws)
 
-    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
+    def trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
         """0..1, how far each hit is accepted by a character whose root is there."""
+        if not self.limited:
+            return self.gentleness(hits.normal, up_ws)
         way = hits.point - root_ws
         rise = vec.dot(way, up_ws)
         slope = least_rise(rise, climb(hits.normal, way, up_ws))

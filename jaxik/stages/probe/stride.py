@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -195,7 +196,8 @@ class StrideProbe(AbstractSupportedProbe):
         heights = level.height(path.point)
         low, high = heights[0], heights[-1]
         last, next_ = (jax.tree.map(lambda x: x[end], path) for end in (0, -1))  # noqa: B023
-        found = jnp.where(last.found > next_.found, last.found, next_.found)
+        fraction = self._eased(stride)
+        found = lerp(last.found, next_.found, fraction)  # a foot that stands has no other ground
         # Without a last foothold, the ground is that of the next, or without that the root's level.
         low = lerp(next_.found * high, low, last.found)
         normal = lerp(next_.normal, last.normal, last.found[..., None])
@@ -206,25 +208,23 @@ class StrideProbe(AbstractSupportedProbe):
         step = high - low - slope
         evened = jnp.concatenate([low[None], heights[1:]]) - slope * fractions
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
-        trust *= self._trust_of_way(evened, path.found)
+        trust *= 1.0 - smoothstep(_least_step(evened, path.found, self.excess) / self.step_fade)
 
-        fraction = self._eased(stride)
         ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
         covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
         height = low + trust * (slope * clip_to_one(covered) + step * fraction)
-        rise = trust * (high - low)
-        top = low + jnp.where(rise > 0, rise, 0.0)
         normal += vec.scale(next_.normal - normal, trust * fraction)
         normal = vec.normalize(normal, level.up_ws)
 
-        edges = jax.tree.map(lambda x: x[1:-1], path)
-        higher = low + jnp.where(step > 0, step, 0.0)
-        over = self.over_footholds(inputs, evened[1:-1], edges.found, higher)
+        between = evened[1:-1] - low, path.found[1:-1]
+        over = self.highest(inputs, between[0] - jnp.where(step > 0, step, 0.0), between[1])
+        chord = trust * step * fractions[1:-1]
+        edge = self.highest(inputs, between[0] - chord, between[1])
         below = self.below_others(inputs, height, normal, found)
+        stair = _least_step(evened, path.found, jnp.abs)
+        step = jnp.where(step > stair, stair, jnp.where(step < -stair, -stair, step))
         swing = self.swing(inputs, stride, step, over, trust, below)
-        soles = self.soles(inputs, foot_height)
-        under_soles = height + self.climb(normal, soles - ball, level.up_ws)
-        height += self.clearance_over_edges(inputs, stride, swing, soles, under_soles, top, edges)
+        height += self.clearance_over_edges(inputs, stride, swing, foot_height, edge)
         height += self.climb(normal, ankle - ball, level.up_ws)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
@@ -232,10 +232,11 @@ class StrideProbe(AbstractSupportedProbe):
         if platform is not None:
             arriving = (last.found <= 0) | (trust * fraction > 0.5)
             platform = jnp.where(arriving, next_.platform, platform)
+        normal = vec.normalize(lerp(level.up_ws, normal, found[..., None]), level.up_ws)
         hit = Hit(ankle_ws, normal, self.ray_up - height, found, platform)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         turns = jnp.ones_like(found)
-        lift, pitch = (jnp.where(found > 0, x, 0.0) for x in (swing.lift, swing.pitch))
+        lift, pitch = found * swing.lift, found * swing.pitch
         return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
@@ -272,30 +273,36 @@ class StrideProbe(AbstractSupportedProbe):
         self, inputs: Inputs, level: Level, points_ws: Array, stood_on: bool = False
     ) -> Hit:
         """The ground above or below these points."""
-        above = level.project(points_ws)
-        away = vec.length(above - level.origin_ws)
-        margin = jnp.where(away > self.max_step_up, STAIRS * (away - self.max_step_up), 0.0)
-        above += vec.scale(level.up_ws, self.ray_up)
-        reach = self.ray_up + self.ray_down
+        above = level.project(points_ws) + vec.scale(level.up_ws, self.ray_up)
+        reach, margin = self.ray_up + self.ray_down, self.margin_at(level, points_ws)
         return self.cast(inputs, above, reach, self.layers, margin, stood_on)
 
-    def _trust_of_way(self, heights: Array, found: Array) -> Float[Array, " legs"]:
-        """0..1, how far the highest step that cannot be avoided on the way is accepted.
+    def margin_at(self, level: Level, points_ws: Array) -> Array:
+        """How much higher and lower than a step the ground may be there, m: as stairs go."""
+        away = vec.length(level.project(points_ws) - level.origin_ws)
+        return jnp.where(away > self.max_step_up, STAIRS * (away - self.max_step_up), 0.0)
 
-        From the last foothold to the next, any points of the way may be stepped on in turn; of all
-        such choices, that with the lowest highest step counts. So stairs are no ledge.
 
-        Args:
-            heights: of the ground along the way, without its slope (points, legs), m.
-            found: of that ground.
-        """
-        excess = [jnp.full_like(heights[0], -FAR)]
-        for point in range(1, len(heights)):
-            steps = self.excess(heights[point] - heights[:point])
-            reached = (jnp.where(a > b, a, b) for a, b in zip(excess, steps, strict=True))
-            least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
-            excess.append(jnp.where(found[point] > 0, least, FAR))
-        return 1.0 - smoothstep(excess[-1] / self.step_fade)
+def _least_step(
+    heights: Array, found: Array, size: Callable[[Array], Array]
+) -> Float[Array, " legs"]:
+    """The size of the highest step that cannot be avoided on a way, m; `FAR` without ground.
+
+    From the last foothold to the next, any points of the way may be stepped on in turn; of all such
+    choices, that with the lowest highest step counts. So stairs are no ledge.
+
+    Args:
+        heights: of the ground along the way, without its slope (points, legs), m.
+        found: of that ground.
+        size: of steps of these heights, m.
+    """
+    highest = [jnp.full_like(heights[0], -FAR)]
+    for point in range(1, len(heights)):
+        steps = size(heights[point] - heights[:point])
+        reached = (jnp.where(a > b, a, b) for a, b in zip(highest, steps, strict=True))
+        least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
+        highest.append(jnp.where(found[point] > 0, least, FAR))
+    return highest[-1]
 
 
 def _mean_ground(grounds: GroundHits, up_ws: Array) -> GroundHits:

@@ -1,8 +1,8 @@
 """How much of a sole the ground supports, and where along the foot it would support more."""
 
+import functools
 from abc import abstractmethod
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,16 +18,16 @@ from .base import foot_heading
 from .limits import climb
 from .swing import AbstractSwingProbe, Level
 
-# In fifths of a sole, from the ball: the points of a sole, and how far it may slide.
-SOLE = np.arange(-4, 2)
-SLIDES = np.arange(-2, 3)
-LINE = np.arange(SOLE[0] + SLIDES[0], SOLE[-1] + SLIDES[-1] + 1)
-EVEN, UNEVEN = 0.3, 0.7  # fifths, from the plane of the sole: ground that supports it, and does not
-SHARE_FADE = 0.10  # of the sole, over which a sole begins to slide
-SAME_SHARE = 0.01  # of the sole, by which supports hardly differ
-SLIDE_COST = 0.03  # of the sole, to be gained by a slide of a fifth of it
+# In tenths of a sole, from the ball: the points of a sole, and how far it may slide.
+SOLE = np.arange(-8, 3)
+SLIDES = np.array([0, 1, -1, 2, -2, 3, -3, 4, -4])  # the shorter of equals comes first
+LINE = np.arange(SOLE[0] + SLIDES.min(), SOLE[-1] + SLIDES.max() + 1)
+EVEN, UNEVEN = 0.06, 0.14  # of the sole, from its plane: ground that supports it, and does not
+BLOCKS = 2.0  # by which ground that sticks out counts against what supports
+SLIDE_COST = 0.15  # of the sole that a slide by the whole of it has to gain
 TOO_FAR = 2.0  # of the sole, more than any slide gains
-HEIGHT_COST = 0.1  # of the sole, to be gained by a slide to ground a fifth of it higher or lower
+FIFTH = 0.2  # of the sole, over which slides become too far
+SHARE_BAND = 0.01  # of the sole
 
 
 class AbstractSupportedProbe(AbstractSwingProbe):
@@ -68,6 +68,10 @@ class AbstractSupportedProbe(AbstractSwingProbe):
     ) -> Hit:
         """The ground above or below these points."""
 
+    @abstractmethod
+    def margin_at(self, level: Level, points_ws: Array) -> Array:
+        """How much higher and lower than a step the ground may be there, m."""
+
     def better_support(
         self, inputs: Inputs, level: Level, stride: Stride, foot_height: Array
     ) -> tuple[Float[Array, "2 legs 3"], Float[Array, "2 legs"]]:
@@ -82,46 +86,48 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         Returns:
             The slides, m, world space, and the shares of the soles that are supported after them.
         """
-        rig, up = inputs.rig, level.up_ws
+        rig, up, gate = inputs.rig, level.up_ws, inputs.gate
         ahead, _ = foot_heading(inputs, up)
         rise = foot_height - self.ball_height
         ankle_to_ball = vec.safe_sqrt(rig.foot**2 - rise**2)
-        spacing = (self.heel_length + ankle_to_ball + self.toe_length) / 5.0
-        fifths = vec.safe_divide(jnp.ones_like(spacing), spacing)  # in a metre
+        sole = self.heel_length + ankle_to_ball + self.toe_length  # m
+        tenth = 0.1 * sole
 
-        steps = vec.scale(ahead, spacing) * jnp.asarray(LINE, spacing.dtype)[:, None, None, None]
         footholds_ws = jnp.stack([stride.last_ws, stride.next_ws])
         foothold = self.ground_at(inputs, level, footholds_ws)
-        starts = foothold.point + steps + vec.scale(up, self.max_step_up)
-        reach = self.max_step_up + self.max_step_down
-        line = self.find(inputs, starts, reach, self.layers)  # (points ends legs)
-        heights = level.height(line.point)
+        margin = self.margin_at(level, footholds_ws)
+        # From where a step up from the foothold ends or, without one, from the character's level.
+        top = self.max_step_up + lerp(margin, level.height(foothold.point), foothold.found)
+        steps = vec.scale(ahead, tenth) * jnp.asarray(LINE, tenth.dtype)[:, None, None, None]
+        starts = level.project(footholds_ws) + steps + vec.scale(up, top)
+        reach = self.max_step_up + self.max_step_down + 2.0 * margin * (1.0 - foothold.found)
+        line = self.find(inputs, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
+        heights = level.height(line.point)  # (points ends legs)
+        firm = line.found * self.trust_from(level.origin_ws, line, up, margin)
 
-        def fit(slide: int) -> tuple[Array, Array]:
-            """Shares of a sole that slides so far that are supported, and that are blocked."""
-            ball = slide - LINE[0]
+        def place(tenths: int) -> tuple[Array, Array, Array]:
+            """What it costs to slide so far, the slide, m, and the share that is supported."""
+            ball = tenths - LINE[0]
             share, blocked = jnp.zeros_like(heights[0]), jnp.zeros_like(heights[0])
-            climbs = climb(line.normal[ball], vec.scale(ahead, spacing), up)
+            climbs = climb(line.normal[ball], vec.scale(ahead, tenth), up)
             for point in SOLE:
                 above = heights[ball + point] - heights[ball] - climbs * float(point)
-                above *= line.found[ball + point] * fifths
+                above *= vec.safe_divide(line.found[ball + point], sole)
                 block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
                 hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
                 share += line.found[ball + point] * (1.0 - block - hollow) / len(SOLE)
                 blocked += block / len(SOLE)
-            return share, blocked
+            slide = tenths * tenth + jnp.zeros_like(share)
+            lack = self.min_sole - firm[ball] * (share - BLOCKS * blocked)
+            cost = jnp.where(lack > 0, lack, 0.0) + SLIDE_COST * 0.1 * abs(tenths)
+            too_far = smoothstep((jnp.abs(slide) - self.max_slide) / (FIFTH * sole))
+            if tenths:
+                too_far = lerp(jnp.ones_like(too_far), too_far, stride.known)
+            return cost + TOO_FAR * too_far, slide, firm[ball] * share
 
-        shares, blocked = (jnp.stack(x) for x in zip(*(fit(int(x)) for x in SLIDES), strict=True))
-        slides = spacing * jnp.asarray(SLIDES, spacing.dtype)[:, None, None]
-        fits = shares - blocked  # (slides ends legs)
-        enough = jnp.where(fits < self.min_sole, fits, self.min_sole)
-        other_ground = jnp.abs(heights[SLIDES - LINE[0]] - heights[-LINE[0]])
-        cost = (SLIDE_COST * jnp.abs(slides) + HEIGHT_COST * other_ground) * fifths
-        too_far = TOO_FAR * smoothstep((jnp.abs(slides) - self.max_slide) * fifths)
-        worth = enough - cost - too_far
-        choice = jax.nn.softmax(worth / SAME_SHARE, axis=0)
-        need = stride.known * foothold.found
-        need *= smoothstep((self.min_sole - fits[-SLIDES[0]]) / SHARE_FADE)
-        support = lerp(shares[-SLIDES[0]], jnp.sum(choice * shares, 0), need)
-        slide = need * jnp.sum(choice * slides, 0)
-        return vec.scale(ahead, slide), foothold.found * support
+        def cheaper(nearer: tuple[Array, ...], farther: tuple[Array, ...]) -> tuple[Array, ...]:
+            stays = gate.below(nearer[0], farther[0], band=SHARE_BAND)
+            return tuple(gate.choose(stays, *x) for x in zip(nearer, farther, strict=True))
+
+        _, slide, support = functools.reduce(cheaper, (place(int(x)) for x in SLIDES))
+        return vec.scale(ahead, slide), support

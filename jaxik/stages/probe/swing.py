@@ -9,13 +9,12 @@ from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Stride, animated_ankles
-from jaxik.world.terrain import Hit
 
 from .base import foot_heading
 from .limits import AbstractLimitedProbe, least_rise
 
 HEIGHT_BAND = 0.01  # m
-ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
+BLEND = 0.3  # of an arc over an edge, in which the animated lift gives way to it
 FAR = 1e6  # m, beyond any ground
 FIRST = 1e-12  # of a swing, in which nothing has moved yet
 SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0.2 of it aside
@@ -70,14 +69,6 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         low=-0.1,
         high=0.1,
         doc="How much of its animated lift a foot may lose as it passes over an edge.",
-    )
-    way_slope: Leaf = parameter(
-        1.5,
-        unit="1",
-        low=0.2,
-        high=5.0,
-        scale="log",
-        doc="Slope, rise over run, at which a foot climbs to an edge and descends from it.",
     )
     heel_length: Leaf = parameter(
         0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
@@ -247,23 +238,14 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         below = jnp.where(counts & (rise - slope > 0), rise - slope, 0.0)
         return jnp.max(below, axis=-1)
 
-    def over_footholds(
-        self, inputs: Inputs, heights: Array, found: Array, top: Array
-    ) -> Float[Array, " legs"]:
-        """How far the highest ground on the way is over both footholds, m.
+    def highest(self, inputs: Inputs, heights: Array, found: Array) -> Float[Array, " legs"]:
+        """The highest of heights of the ground on the way (points legs), m; 0 if all are below.
 
-        Args:
-            inputs: the frame.
-            heights: of the ground along the way (points legs), m.
-            found: of that ground.
-            top: height of the higher foothold, m.
+        What is higher than a foot can step up does not count.
         """
-        gate = inputs.gate
-        over = jnp.where(found > 0, heights - top, -FAR)
-        highest = gate.maximum(jnp.moveaxis(over, 0, -1), band=HEIGHT_BAND)
-        zero = jnp.zeros_like(highest)
-        highest = gate.clip(highest, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        return highest * (1.0 - smoothstep((highest - self.max_step_up) / self.step_fade))
+        counts = 1.0 - smoothstep((heights - self.max_step_up) / self.step_fade)
+        heights = jnp.where((found > 0) & (heights > 0), heights * counts, 0.0)
+        return inputs.gate.maximum(jnp.moveaxis(heights, 0, -1), band=HEIGHT_BAND)
 
     def soles(self, inputs: Inputs, foot_height: Array) -> Array:
         """Animated heels, balls and toes' tips at sole height, (3 legs 3), m, world space."""
@@ -276,39 +258,30 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         return jnp.stack([heel, ball, ball + vec.scale(ahead, self.toe_length)])
 
     def clearance_over_edges(
-        self,
-        inputs: Inputs,
-        stride: Stride,
-        swing: Swing,
-        soles: Array,
-        under_soles: Array,
-        top: Array,
-        hit: Hit,
+        self, inputs: Inputs, stride: Stride, swing: Swing, foot_height: Array, edge: Array
     ) -> Float[Array, " legs"]:
         """How much higher each foot goes to clear what lies between its footholds, m.
 
-        `under_soles` is the height of the ground that each sole was lifted from, m; `hit` is the
-        ground between the footholds (points legs).
+        As in one arc over the highest edge, where the foot is not lifted so high already.
+
+        Args:
+            inputs: the frame.
+            stride: where the feet are in it.
+            swing: what it adds to the animation.
+            foot_height: of the ankles over the soles, m.
+            edge: how far the highest edge is over the line between the footholds, m.
         """
-        gate = inputs.gate
         level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
-        ground = level.height(hit.point)
-        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / self.step_fade)
+        soles, ankle = self.soles(inputs, foot_height), animated_ankles(inputs.frame).pos
         # A sole that the animation sinks into its own floor needs no correction.
         lift = level.height(soles) - self.clearance
-        lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
-        ankle = animated_ankles(inputs.frame).pos
+        lift = jnp.where(lift > 0, lift, 0.0) + swing.lift
         pitched = ankle + quat.rotate(pitch_rotation(inputs, swing.pitch), soles - ankle)
-        lift += swing.lift + level.height(pitched) - level.height(soles)
-        away = vec.length(vec.reject(hit.point[:, None] - pitched, level.up_ws))
-        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
-        rise = excess - lift  # (points 3 legs)
-        rise = jnp.where(hit.found[:, None] > 0, rise, -FAR)
-        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *top.shape), 0, -1), band=HEIGHT_BAND)
-        zero = jnp.zeros_like(most)
-        most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        fade_in = smoothstep(stride.fraction / ENDS)
-        return most * fade_in * smoothstep((1.0 - stride.fraction) / ENDS)
+        lift += level.height(pitched) - level.height(soles)
+        lowest = inputs.gate.minimum(jnp.moveaxis(lift, 0, -1), band=HEIGHT_BAND)
+        arc = edge * 0.5 * (1.0 - jnp.cos(2.0 * jnp.pi * stride.fraction))
+        gap, blend = arc - lowest, BLEND * arc
+        return 0.5 * (gap + vec.safe_sqrt(gap * gap + blend * blend))
 
 
 def s_curve(fraction: Array, steepness: Array) -> Array:

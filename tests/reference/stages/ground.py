@@ -86,15 +86,15 @@ class Foot(Leg):
     @property
     def grounded(self) -> float:
         """Contact weight of a foot with ground under it, else 0."""
-        return self.contact if self.hit.found else 0.0
+        return self.contact * self.hit.found
 
     @property
     def foothold_ws(self) -> Array:
         """Where the foot would stand: the hit, raised by what a flat sole on a slope needs."""
-        if not self.hit.found:
-            return self.pos_ws("ankle") - self.up * self.lift
         cosine = max(float(self.hit.normal @ self.up), math.cos(self["target.max_slope"]))
-        return self.hit.point + self.up * (self["target.foot_height"] * (1.0 / cosine - 1.0))
+        on_ground = self.hit.point + self.up * self["target.foot_height"] * (1.0 / cosine - 1.0)
+        animated = self.pos_ws("ankle") - self.up * (self.lift - self.swing_lift)
+        return lerp(animated, on_ground, self.hit.found)
 
 
 def sense(leg: Leg) -> Foot:

@@ -13,7 +13,7 @@ from reference.stages.ground import Foot
 # Forward distance from ankle hit to toe hit, m, below which their heights give no pitch.
 SHORT_FOOT = 0.01
 # Sine of a leg's angle ahead of its hip, up to which a heel rises, and from which it stays.
-RISES, STAYS = 0.2, 0.4
+RISES, STAYS, SHORTENS = 0.0, 0.3, 0.3
 
 
 class Solved(NamedTuple):
@@ -237,7 +237,9 @@ def raise_heel(
     if by_sine < 0.0:
         reach = math.hypot(by_cosine, by_sine)
         angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
-        lift = clip(angle + math.atan2(by_sine, by_cosine), 0.0, foot["effector.max_lift"])
+        angle += math.atan2(by_sine, by_cosine)
+        angle *= maths.smooth01(-by_sine / reach / SHORTENS)
+        lift = clip(angle, 0.0, foot["effector.max_lift"])
     to_ankle = target - hip
     ahead = float(to_ankle @ heading) / length(to_ankle)
     lift *= 1.0 - maths.smooth01((ahead - RISES) / (STAYS - RISES))

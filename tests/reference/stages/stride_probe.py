@@ -7,7 +7,7 @@ along the up of the leg, m.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -20,14 +20,14 @@ from reference.stages.limits import FADE, gentle, low_enough
 from reference.terrain import Hit
 
 PATH = (np.arange(8) + 0.5) / 8  # where ground is looked for, parts of the way between footholds
-EDGE_FRACTION = 0.15  # of the swing's time at either end, over which the path fades out
+GIVES_WAY = 0.3  # of an arc over an edge, in which the lift gives way to it
+STAIRS = 0.75  # rise over run
 
-# Of a sole: fifths from its ball, those that it slides at most, those from its plane that support.
-HEEL, TIP = -4, 1
-FURTHEST = 2
-SUPPORTS, DOES_NOT = 0.3, 0.7
-SUPPORT_FADE, INDIFFERENCE = 0.10, 0.01  # of the sole
-ASIDE_COSTS, HEIGHT_COSTS = 0.03, 0.1  # of the sole, for each fifth of it
+# Of a sole: tenths from its ball, those that it slides at most, parts from its plane that support.
+HEEL, TIP = -8, 2
+FURTHEST = 4
+SUPPORTS, DOES_NOT = 0.06, 0.14
+STICKING, SLIDING = 2.0, 0.15  # cost of all of a sole that sticks in the ground, or slides away
 
 # Of a swing: parts of its time when each bump is highest.
 SHARPNESS = 7.0
@@ -71,15 +71,14 @@ class UnderBall:
     """The ground under the ball of a leg, as its stride leads from one foothold to the other."""
 
     stride: Swing
-    found: bool
+    found: float
     height: float = 0.0
     normal: Array = field(default_factory=lambda: np.zeros(3))
     step: float = 0.0
     over: float = 0.0
+    edge: float = 0.0
     sure: float = 0.0
-    top: float = 0.0
     platform: int = -1
-    path: Sequence[float | None] = ()  # heights along the way; None without ground
 
 
 def height(leg: Leg, point: Array) -> float:
@@ -134,7 +133,7 @@ def eased(leg: Leg, fraction: float) -> float:
 
 def slide_to_support(leg: Leg, stride: Swing) -> tuple[Swing, Slide]:
     """The stride between footholds that support more of the sole, and how far the foot slides."""
-    slides = [slide(leg, look(leg, pos), stride.known) for pos in (stride.last, stride.next)]
+    slides = [slide(leg, pos, stride.known) for pos in (stride.last, stride.next)]
     last, following = (
         pos + slide.forward * leg.heading_ws
         for pos, slide in zip((stride.last, stride.next), slides, strict=True)
@@ -144,20 +143,24 @@ def slide_to_support(leg: Leg, stride: Swing) -> tuple[Swing, Slide]:
     return replace(stride, last=last, next=following), Slide(forward, share)
 
 
-def slide(leg: Leg, foothold: Hit, known: bool) -> Slide:
-    """Where the foot that would stand with its ball on this foothold, if known, stands instead."""
-    if not foothold.found:
-        return Slide(0.0, 0.0)
-    up, heading = leg.up, leg.heading_ws
+def slide(leg: Leg, level_point: Array, known: bool) -> Slide:
+    """Where the foot that would stand with its ball here, if that is known, stands instead."""
+    up, heading, foothold = leg.up, leg.heading_ws, look(leg, level_point)
     # The sole reaches from behind the ankle to beyond the ball.
     drop = leg["target.foot_height"] - leg["probe.ball_height"]
     between = math.sqrt(max(leg.rig.foot**2 - drop**2, 0.0))
-    fifth = (between + leg["probe.heel_length"] + leg["probe.toe_length"]) / 5.0
+    sole = between + leg["probe.heel_length"] + leg["probe.toe_length"]
     highest, deepest = leg["probe.max_step_up"], leg["probe.max_step_down"]
+    if foothold.found:
+        start, reach = height(leg, foothold.point) + highest, highest + deepest
+    else:
+        way = length(level_point - leg.frame.world_from_model.pos)
+        margin = STAIRS * max(way - highest, 0.0)
+        start, reach = highest + margin, highest + deepest + 2.0 * margin
     hits = {
         place: leg.terrain.cast(
-            foothold.point + place * fifth * heading + highest * up,
-            highest + deepest,
+            level_point + place / 10.0 * sole * heading + start * up,
+            reach,
             int(leg["probe.layers"]),
         )
         for place in range(HEEL - FURTHEST, TIP + FURTHEST + 1)
@@ -165,35 +168,30 @@ def slide(leg: Leg, foothold: Hit, known: bool) -> Slide:
 
     def fit(ball: int) -> tuple[float, float]:
         """Shares of the sole that are supported and that stick in the ground."""
+        if not hits[ball].found:
+            return 0.0, 0.0
         on, stuck = [], []
         normal = hits[ball].normal
         slope = -float(across(heading, up) @ normal) / float(normal @ up)
         for place in range(ball + HEEL, ball + TIP + 1):
-            over = float((hits[place].point - hits[ball].point) @ up)
-            over -= slope * fifth * (place - ball)
-            off = smooth01((abs(over) / fifth - SUPPORTS) / (DOES_NOT - SUPPORTS))
+            over = float((hits[place].point - hits[ball].point) @ up) / sole
+            over -= slope * (place - ball) / 10.0
+            off = smooth01((abs(over) - SUPPORTS) / (DOES_NOT - SUPPORTS))
             found = hits[place].found
             on.append(1.0 - off if found else 0.0)
             stuck.append(off if found and over > 0.0 else 0.0)
-        return float(np.mean(on)), float(np.mean(stuck))
+        firm = gentle(leg, normal)
+        return firm * float(np.mean(on)), firm * float(np.mean(stuck))
 
-    enough, furthest = leg["probe.min_sole"], leg["probe.max_slide"]
-    places = range(-FURTHEST, FURTHEST + 1)
-    supported = {place: fit(place) for place in places}
-    here, stuck_here = supported[0]
-    if not known:
-        return Slide(0.0, here)
-    gains = []
-    for place, (share, stuck) in supported.items():
-        climbed = abs(float((hits[place].point - hits[0].point) @ up))
-        gain = min(share - stuck, enough) - ASIDE_COSTS * abs(place)
-        gain -= HEIGHT_COSTS * climbed / fifth
-        gains.append(gain - 2.0 * smooth01((abs(place) * fifth - furthest) / fifth))
-    chance = np.exp((np.array(gains) - max(gains)) / INDIFFERENCE)
-    chance /= chance.sum()
-    need = smooth01((enough - (here - stuck_here)) / SUPPORT_FADE)
-    there = float(chance @ [share for share, _ in supported.values()])
-    return Slide(need * fifth * float(chance @ places), lerp(here, there, need))
+    def cost(place: int) -> float:
+        share, stuck = fit(place)
+        far = abs(place) / 10.0
+        lack = max(leg["probe.min_sole"] - share + STICKING * stuck, 0.0)
+        return lack + SLIDING * far + 2.0 * smooth01(5.0 * (far - leg["probe.max_slide"] / sole))
+
+    places = sorted(range(FURTHEST, -FURTHEST - 1, -1), key=abs) if known else [0]
+    best = min(places, key=cost)
+    return Slide(best / 10.0 * sole, fit(best)[0])
 
 
 # The ground under a foot
@@ -203,7 +201,9 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
     """The ground under the ball of a leg in this stride."""
     last, following = (look(leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
-        return UnderBall(stride, found=False)
+        return UnderBall(stride, found=0.0)
+    risen = eased(leg, stride.fraction)
+    found = lerp(float(last.found), float(following.found), risen)
     arrives = float(following.found)  # a swing to nowhere stays as animated
     last = last if last.found else following
     following = following if following.found else last
@@ -216,13 +216,22 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
     hits = [look(leg, stride.way(part)) for part in PATH]
     path = [height(leg, hit.point) if hit.found else None for hit in hits]
     sure = gentle(leg, following.normal) * climbable(leg, [low, *path, high], slope)
-    evened = [at - slope * part for at, part in zip(path, PATH, strict=True) if at is not None]
-    over = max(0.0, max(evened) - low - max(step, 0.0)) if evened else 0.0
-    over *= 1.0 - smooth01((over - leg["probe.max_step_up"]) / FADE)
-    high = lerp(low, high, sure)
+    evened = [
+        (part, at - slope * part - low)
+        for at, part in zip(path, PATH, strict=True)
+        if at is not None
+    ]
+    chord = sure * arrives * step
+    over, edge = (
+        highest(leg, heights)
+        for heights in (
+            [at - max(step, 0.0) for _, at in evened],
+            [at - chord * part for part, at in evened],
+        )
+    )
+    stair = easiest(lambda _, step: -abs(step), leg, [low, *path, high], slope)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
-    risen = eased(leg, stride.fraction)
     squared = float(across_ws @ across_ws)
     on_its_way = 0.0
     if squared > 0.0:
@@ -230,9 +239,15 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
     ground = low + sure * (slope * clip(on_its_way, 0.0, 1.0) + step * risen)
     normal = unit(last.normal + risen * (next_normal - last.normal), leg.up)
     platform = following.platform if sure * risen > 0.5 else last.platform
-    return UnderBall(
-        stride, True, ground, normal, step, over, sure * arrives, max(low, high), platform, path
-    )
+    step = clip(step, stair, -stair)
+    return UnderBall(stride, found, ground, normal, step, over, edge, sure * arrives, platform)
+
+
+def highest(leg: Leg, heights: Sequence[float]) -> float:
+    """The highest of these, m, 0 if all are lower; what nobody can step onto does not count."""
+    limit = leg["probe.max_step_up"]
+    counting = [x * (1.0 - smooth01((x - limit) / FADE)) for x in heights if x > 0.0]
+    return max(counting, default=0.0)
 
 
 def below_others(leg: Leg, legs: list[Leg], balls: list[UnderBall]) -> float:
@@ -258,7 +273,6 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
     if not ball.found:
         return Hit(False, here, leg.up), stride
     lift, pitch = beyond_animation(leg, ball, below)
-    stride = replace(stride, lift=lift, pitch=pitch)
 
     def beside_ball(point: Array) -> float:
         """Height of the ground under a point of the foot, on the plane under its ball, m."""
@@ -266,46 +280,48 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
 
     def lift_over_edges() -> float:
         """How far the ground must be raised for the animated sole to clear what is on its path."""
-        axes, need = leg.world_from_foot, 0.0
+        axes = leg.world_from_foot
         behind = np.array([0.0, -leg["target.foot_height"], -leg["probe.heel_length"]])
         sole = ball_ws - leg.up * leg["probe.ball_height"]
         tip = sole + rotate(axes, maths.Z * leg["probe.toe_length"])
         turn = maths.from_axis_angle(axis_of_pitch(leg), pitch)
-        for part, edge in zip(PATH, ball.path, strict=True):
-            if edge is None:
-                continue
-            counts = 1.0 - smooth01((edge - ball.top - leg["probe.max_step_up"]) / FADE)
-            for point in (ankle + rotate(axes, behind), sole, tip):
-                moved = ankle + rotate(turn, point - ankle)
-                away = length(across(moved - stride.way(part), leg.up))
-                over = edge - leg["probe.way_slope"] * away - beside_ball(point)
-                # The clearance that the animation has over its own floor is subtracted.
-                clearance = max(height(leg, point) - leg["probe.clearance"], 0.0)
-                added = lift + float((moved - point) @ leg.up)
-                need = max(need, counts * over - clearance - added)
-        return need
+        arc = ball.edge * math.sin(math.pi * stride.fraction) ** 2
+        lowest = math.inf
+        for point in (ankle + rotate(axes, behind), sole, tip):
+            # The clearance that the animation has over its own floor counts, not its depth.
+            clearance = max(height(leg, point) - leg["probe.clearance"], 0.0)
+            moved = ankle + rotate(turn, point - ankle)
+            lowest = min(lowest, clearance + lift + float((moved - point) @ leg.up))
+        return 0.5 * (arc - lowest + math.hypot(arc - lowest, GIVES_WAY * arc))
 
-    passed, left = stride.fraction, 1.0 - stride.fraction
-    window = smooth01(passed / EDGE_FRACTION) * smooth01(left / EDGE_FRACTION)
-    point = here + leg.up * (beside_ball(ankle) + window * lift_over_edges())
-    return Hit(True, point, ball.normal, ball.platform), stride
+    point = here + leg.up * (beside_ball(ankle) + lift_over_edges())
+    stride = replace(stride, lift=lift * ball.found, pitch=pitch * ball.found)
+    normal = unit(lerp(leg.up, ball.normal, ball.found), leg.up)
+    return Hit(ball.found, point, normal, ball.platform), stride
 
 
 def climbable(leg: Leg, heights: Sequence[float | None], slope: float) -> float:
-    """From 0 to 1, how far the easiest choice of points to step on has steps that are low enough.
+    """From 0 to 1, how far the easiest choice of points has steps that are low enough."""
+    return easiest(low_enough, leg, heights, slope)
+
+
+def easiest(
+    ease: Callable[[Leg, float], float], leg: Leg, heights: Sequence[float | None], slope: float
+) -> float:
+    """The ease of the hardest step of the easiest choice of points to step on.
 
     All choices are tried: any points of the way, in their order, between the two footholds.
     """
     pairs = zip(heights, (0.0, *PATH, 1.0), strict=True)
     start, *middle, end = [at - slope * place for at, place in pairs if at is not None]
-    best = 0.0
-    for count in range(len(middle) + 1):
-        for chosen in itertools.combinations(middle, count):
-            steps = np.diff([start, *chosen, end])
-            best = max(best, min(low_enough(leg, float(step)) for step in steps))
-            if best == 1.0:
-                return best
-    return best
+    choices = (
+        chosen
+        for count in range(len(middle) + 1)
+        for chosen in itertools.combinations(middle, count)
+    )
+    return max(
+        min(ease(leg, float(step)) for step in np.diff([start, *chosen, end])) for chosen in choices
+    )
 
 
 def climb(leg: Leg, normal: Array, moved: Array) -> float:

@@ -18,7 +18,7 @@ from reference.terrain import ALL_LAYERS
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
     "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.025, shift=0.15)
-    | named("pelvis", rise_half_life=0.04, fall_half_life=0.04, spring=True),
+    | named("pelvis", rise_half_life=0.03, fall_half_life=0.03, spring=True),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
 }
@@ -30,7 +30,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
     of_record = {name: x for name, x in characters.DEFAULTS.items() if name.startswith(kept)}
     return (
         {**of_record, **CONTACTS[contact], **PELVISES[pelvis], **spine.DEFAULTS}
-        | named("probe", ray_up=1.0, ray_down=1.0, layers=ALL_LAYERS, clearance=0.0, way_slope=1.5)
+        | named("probe", ray_up=1.0, ray_down=1.0, layers=ALL_LAYERS, clearance=0.0)
         | named("probe", rise_start=0.0, rise_end=1.0, steepness=1.875)
         | named("probe", max_step_up=0.6, max_step_down=0.6, max_slope=1.05)
         | named("probe", heel_length=0.07, ball_height=0.055, toe_length=0.04, toe_clearance=0.03)
