@@ -15,8 +15,8 @@ from .clip import Clip, local_from_world, world_from_local
 from .joint_maps import partners
 from .rigs import with_sole, with_soles
 
-POP = 0.02  # m: a second difference at `POP_RATE` that no body produces
-POP_RATE = 120.0  # Hz
+MARKER_JUMP = 0.02  # m: a second difference at `MARKER_RATE` that no body produces
+MARKER_RATE = 120.0  # Hz
 REST_ANGLE = np.radians(1.0)  # a joint rotated less is at rest
 REST_FRACTION = 0.5  # of the joints that turn, at rest in a T-pose
 JUMP = 4.0  # times the median step: the step from a T-pose into the motion
@@ -181,7 +181,7 @@ def on_floor(clip: Clip, floor: float, sole: float | None = None) -> Clip:
     return replace(clip, measured_rig=rig, remarks=remarks)
 
 
-def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:
+def marker_jumps(clip: Clip) -> Bool[np.ndarray, " frames"]:
     """True where the pelvis, a knee, an ankle or a toe jumps as if a marker had slipped."""
     rig = clip.rig
     joints = [rig.pelvis, *(joint for leg in rig.joints for joint in leg[1:])]
@@ -202,14 +202,14 @@ def jumps(
     second_difference = np.diff(positions_ws, n=2, axis=0)
     jumped = np.zeros(len(positions_ws), bool)
     if len(positions_ws) > 2:
-        limit = POP * (POP_RATE / fps) ** 2
+        limit = MARKER_JUMP * (MARKER_RATE / fps) ** 2
         jumped[1:-1] = (np.linalg.norm(second_difference, axis=-1) > limit).any(axis=1)
     return jumped
 
 
-def mask_pops(clip: Clip) -> Clip:
-    """The clip with frames of marker pops masked, in addition to those masked already."""
-    good = ~pops(clip)
+def mask_marker_jumps(clip: Clip) -> Clip:
+    """The clip with frames in which a marker jumps masked, in addition to those masked already."""
+    good = ~marker_jumps(clip)
     return replace(clip, mask=clip.observed & good)
 
 

@@ -67,8 +67,8 @@ def describe(clip: Clip) -> ClipSummary:
         warnings.append(f"starts with a T-pose; the motion begins at frame {first}")
     if last < end:
         warnings.append(f"the last frame is repeated {end - last} times")
-    if clip.measured_rig is not None and (popped := int(edit.pops(clip).sum())):
-        warnings.append(f"markers pop in {popped} frames")
+    if clip.measured_rig is not None and (jumps := int(edit.marker_jumps(clip).sum())):
+        warnings.append(f"markers jump in {jumps} frames")
     return {
         "file": clip.source,
         "frames": clip.frame_count,

@@ -188,7 +188,9 @@ def load_clip_data(
         captured = _load_reference(entry)
     if entry.mask_pops:
         with error_context(entry.reference):
-            captured = edit.mask_pops(captured)  # before resampling, which would smear a pop
+            captured = edit.mask_marker_jumps(
+                captured
+            )  # before resampling, which would smear a jump
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         check_ground(reference)

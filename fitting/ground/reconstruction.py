@@ -607,13 +607,13 @@ def find_stances(clip: Clip, sole: float) -> Stances:
     """Position and height of every stance of a clip.
 
     They are medians over the frames in which the foot is stillest, without frames in which a marker
-    popped. A foot on its toes often leans on an edge or hangs over one, so it is used only if no
+    jumped. A foot on its toes often leans on an edge or hangs over one, so it is used only if no
     flat stance is near.
 
     Raises:
         ValueError: no foot ever stands.
     """
-    clip = edit.mask_pops(clip)
+    clip = edit.mask_marker_jumps(clip)
     standing, ankles, balls = clip.stance_labels(), clip.joints_ws(2), clip.joints_ws(3)
     records = []
     for leg in range(standing.shape[1]):

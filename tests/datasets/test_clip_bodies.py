@@ -576,16 +576,16 @@ def test_a_t_pose_its_ramp_and_repeated_last_frames_are_dropped(tmp_path, walk, 
         assert edit.drop_t_pose(other) is other
 
 
-def test_a_popped_marker_is_masked(walk):
+def test_a_marker_that_jumps_is_masked(walk):
     positions = np.array(walk.positions_ws)
     positions[50, 7] += [0.0, 0.3, 0.0]
-    popped = edit.mask_pops(walk.with_motion(positions, walk.rotations_ws))
-    assert np.flatnonzero(edit.pops(popped)).tolist() == [49, 50, 51]
-    assert np.flatnonzero(popped.mask == 0).tolist() == [49, 50, 51]
-    assert not edit.pops(walk).any()
-    again = edit.mask_pops(replace(walk, mask=popped.mask))
-    assert again.mask is not None and (again.mask == popped.mask).all()
-    assert any("markers pop in 3 frames" in warning for warning in describe(popped)["warnings"])
+    jumping = edit.mask_marker_jumps(walk.with_motion(positions, walk.rotations_ws))
+    assert np.flatnonzero(edit.marker_jumps(jumping)).tolist() == [49, 50, 51]
+    assert np.flatnonzero(jumping.mask == 0).tolist() == [49, 50, 51]
+    assert not edit.marker_jumps(walk).any()
+    again = edit.mask_marker_jumps(replace(walk, mask=jumping.mask))
+    assert again.mask is not None and (again.mask == jumping.mask).all()
+    assert any("markers jump in 3 frames" in warning for warning in describe(jumping)["warnings"])
 
 
 def test_a_clip_mirrored_twice_is_the_clip_and_without_symmetry_it_is_refused(walk):
@@ -620,8 +620,8 @@ def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
 
 
 def test_marker_pops_and_t_poses_of_the_reference_files(mocap):
-    pops = edit.pops(load_clip(mocap / "blocks/03_03.npz"))
-    assert pops.sum() == 52  # as facts.json counts them
+    jumps = edit.marker_jumps(load_clip(mocap / "blocks/03_03.npz"))
+    assert jumps.sum() == 52  # as facts.json counts them
     spans = {
         "cmu_bvh_mb/cmu_12_01_walk.bvh": (1, 523),
         "cmu_bvh_poser/03_01.bvh": (7, 432),

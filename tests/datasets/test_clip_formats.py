@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.clips import Clip, formats, guesses, load_clip, save_clip
 from fitting.clips.clip import INCH, Y_UP_FROM_Z_UP, Recording
-from fitting.clips.edit import mask_pops
+from fitting.clips.edit import mask_marker_jumps
 from fitting.clips.formats.asfamc import read_asfamc
 from fitting.clips.formats.bvh import read_bvh
 from fitting.synthetic import multi_limb, walker
@@ -396,7 +396,7 @@ ROLES = ("hip", "knee", "ankle", "ball")
 
 @pytest.fixture(scope="module")
 def walk():
-    return replace(mask_pops(stair_walk()), remarks=("first", "second"))
+    return replace(mask_marker_jumps(stair_walk()), remarks=("first", "second"))
 
 
 @pytest.fixture

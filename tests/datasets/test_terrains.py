@@ -329,10 +329,10 @@ def test_stances_are_at_the_balls_with_the_ground_a_sole_below_even_if_a_marker_
     points_ws = np.insert(stances.points, 1, 0.0, axis=1)
     np.testing.assert_allclose(stances.heights, slope(points_ws) - 0.02, atol=0.002)
     ((first, last), *_) = contacts.runs(clip.stance_labels()[:, 0])
-    positions = clip.positions_ws.copy()  # in which a marker pops
+    positions = clip.positions_ws.copy()  # in which a marker jumps
     positions[first + 2 : last - 2 : 3, clip.rig.joints[0][3]] += [0.0, 0.2, 0.0]
-    popped = clip.with_motion(positions, clip.rotations_ws)
-    heights = reconstruction.find_stances(popped, sole=0.02).heights
+    jumping = clip.with_motion(positions, clip.rotations_ws)
+    heights = reconstruction.find_stances(jumping, sole=0.02).heights
     np.testing.assert_allclose(heights, stances.heights, atol=0.002)
     positions[100:] += [1e6 / 2, 0.0, 0.0]
     with pytest.raises(ValueError, match="stances are up to 5e.05 m apart; wanted at most 1000"):

@@ -16,7 +16,7 @@ from PIL import Image
 
 from fitting.clips import load_clip, save_clip
 from fitting.clips.clip import Clip
-from fitting.clips.edit import mask_pops
+from fitting.clips.edit import mask_marker_jumps
 from fitting.clips.joint_maps import template
 from fitting.experiment import originals, parameter_files, record_files, track_files
 from fitting.experiment.experiment_files import load_experiment
@@ -144,7 +144,7 @@ def clip_bytes(suffix: str) -> bytes:
     """A clip as we write it, with all tracks that the format has."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"clip{suffix}"
-        save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
+        save_clip(path, mask_marker_jumps(stair_walk()).select(slice(0, 20)))
         return path.read_bytes()
 
 

@@ -120,16 +120,19 @@ def test_a_swing_leaves_its_path_smoothly_and_a_standing_foot_stays(problem):
     assert np.median(np.abs(np.diff(size, axis=0))[moving[1:]]) < steepest
 
 
-def test_pops_are_jumps_of_a_few_frames_which_a_fit_leaves_out(problem):
+def test_markers_jump_for_a_few_frames_which_a_fit_leaves_out(problem):
     shape = (len(TIME), 5, 3)
-    pops = [wrong_model.pops(shape, TIME, 0.1, np.random.default_rng(seed)) for seed in range(200)]
-    size = np.linalg.norm(pops, axis=-1)
+    jumps = [
+        wrong_model.marker_jumps(shape, TIME, 0.1, np.random.default_rng(seed))
+        for seed in range(200)
+    ]
+    size = np.linalg.norm(jumps, axis=-1)
     np.testing.assert_allclose(size[size > 0], 0.1)
     runs = [contacts.runs(joint > 0) for replicate in size for joint in replicate.T]
     lengths = [last - first + 1 for each in runs for first, last in each]
-    assert len(lengths) / 200 == pytest.approx(TIME[-1] / wrong_model.POP_EVERY, rel=0.1)
+    assert len(lengths) / 200 == pytest.approx(TIME[-1] / wrong_model.JUMP_EVERY, rel=0.1)
     assert set(lengths) >= {1, 2, 3, 4} and np.mean(lengths) == pytest.approx(2.5, abs=0.2)
-    whole, masked = (changes(problem, mask, seed=3, pop=1.0).seen for mask in (False, True))
+    whole, masked = (changes(problem, mask, seed=3, jump=1.0).seen for mask in (False, True))
     assert whole.all() and 0 < (~masked).sum() < 60
 
 

@@ -86,8 +86,8 @@ WORSE = 0.002  # m rms, further off than the animation
 WORDS = "fits", "does not fit", "worse"
 
 DRIFT_PERIODS = (10.0, 30.0)  # s
-POP_EVERY = 2.0  # s, on average
-POP_FRAMES = 4  # at most
+JUMP_EVERY = 2.0  # s, on average
+JUMP_FRAMES = 4  # at most
 SWING_SPEED = 0.4  # m/s, of an animated ankle, above which its foot swings
 KNEE_SHARE = 0.5  # of the ankle's deviation in a swing
 
@@ -306,7 +306,7 @@ def fit_wrong_model(
     ik, values = draw_system(truth, rig, random)
     masked = [clip.mask_pops for clip in experiment.clips]
     exact, sizes = with_motion_of(problem, ik), draw_sizes(random, noise_factor)
-    lasting_sizes = dataclasses.replace(sizes, pop=0.0, noise=0.0)
+    lasting_sizes = dataclasses.replace(sizes, jump=0.0, noise=0.0)
     lasting = with_errors(exact, lasting_sizes, masked, copy.deepcopy(random))
     captured = with_errors(exact, sizes, masked, random)
     own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
@@ -470,7 +470,7 @@ class ErrorSizes:
     pelvis."""
     turn: float
     """rad, likewise of the constant rotations of pelvis and feet."""
-    pop: float
+    jump: float
     """m, by which a marker jumps, with one or more frames of one joint."""
     swing: float
     """m, by which a swinging ankle is off its path in mid-swing, smoothly."""
@@ -478,7 +478,7 @@ class ErrorSizes:
     """m, standard deviation of each coordinate, independent in each frame."""
 
 
-LARGEST = ErrorSizes(drift=0.01, offset=0.01, turn=0.03, pop=0.10, swing=0.03, noise=0.002)
+LARGEST = ErrorSizes(drift=0.01, offset=0.01, turn=0.03, jump=0.10, swing=0.03, noise=0.002)
 
 
 def draw_sizes(random: np.random.Generator, factor: float = 1.0) -> ErrorSizes:
@@ -510,7 +510,9 @@ def _with_errors(
     time, count = np.cumsum(dt) - dt[0], len(scene.rig.side)
     joints = (len(dt), 1 + 2 * count, 3)  # pelvis, knees, ankles
     deviation = swing_deviation(np.asarray(scene.frames.foot_speed), sizes.swing, random)
-    shift = sizes.noise * random.normal(size=joints) + pops(joints, time, sizes.pop, random)
+    shift = sizes.noise * random.normal(size=joints) + marker_jumps(
+        joints, time, sizes.jump, random
+    )
     drift = floor_drift(time, sizes.drift, random)
     shift += drift[:, None, None] * np.asarray(scene.terrain.up_ws)
     heading = Rotation.from_quat(np.asarray(reference.pelvis.rot), scalar_first=True)
@@ -559,7 +561,7 @@ def swing_deviation(speed: Series, size: float, random: np.random.Generator) -> 
     return deviation
 
 
-def pops(
+def marker_jumps(
     shape: tuple[int, int, int], time: Series, size: float, random: np.random.Generator
 ) -> Series:
     """Jumps of `size`, m, of single joints for a few frames, as of a marker mistaken for another.
@@ -568,10 +570,10 @@ def pops(
     """
     frames, joints, _ = shape
     jumps = np.zeros(shape)
-    for _ in range(random.poisson(time[-1] / POP_EVERY)):
+    for _ in range(random.poisson(time[-1] / JUMP_EVERY)):
         first, joint = random.integers(frames), random.integers(joints)
         direction = random.normal(size=3)
-        last = first + random.integers(1, POP_FRAMES + 1)
+        last = first + random.integers(1, JUMP_FRAMES + 1)
         jumps[first:last, joint] = size * direction / np.linalg.norm(direction)
     return jumps
 
