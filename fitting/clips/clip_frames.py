@@ -237,7 +237,7 @@ def _turn(
 
 
 def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:
-    """World positions, m, under the names that the scoring of the `blocks` benchmark reads.
+    """World positions, m, under the names of an archive of positions.
 
     `pelvis` is (frames, 3); `hip`, `knee`, `ankle` and `ball` are (frames, legs, 3).
     """

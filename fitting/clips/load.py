@@ -84,7 +84,6 @@ def load_clip(
     fps: float | None = None,
     up: str | None = None,
     joints: JointMap | None = None,
-    variant: str = "captured",
     animation: str | None = None,
     travel: str | None = None,
     sole: float | None = None,
@@ -102,8 +101,6 @@ def load_clip(
         joints: role to joint name, see `joint_maps.find_roles`, or a joint map, see
             `clips.joint_maps`; None recognises the names. Of a C3D file it names markers, see
             `clips.formats.c3d.read_c3d`.
-        variant: which clip of a file of the `blocks` benchmark: "captured" or "base", the flat
-            animation.
         animation: which animation of a glTF file; None takes the only one.
         travel: "stances" moves the root so that standing feet stay where they stand, "none" leaves
             it, and "auto", or None, moves it in a cycle that is clearly in place.
@@ -129,9 +126,7 @@ def load_clip(
         arguments = {**vars(overrides), "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
-        return edit.on_floor(read_npz(path, variant), 0.0, sole)
-    if variant != "captured":
-        raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
+        return edit.on_floor(read_npz(path), 0.0, sole)
     if suffix == ".c3d":
         recording = read_c3d(path, joints, scale)
         if joints is not None:  # which named markers

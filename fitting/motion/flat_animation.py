@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.clips import contacts, edit, load_clip
 from fitting.clips.clip import Clip, local_from_world, world_from_local
-from fitting.clips.formats.npz import is_blocks_file
+from fitting.clips.formats.npz import holds_base, read_base
 from fitting.clips.load import AS_FOUND, ClipOptions
 from fitting.clips.rigs import Vectors, bone_rotation, knee_hinges, knee_positions, unit
 from fitting.ground.coverage import FLAT, relief
@@ -108,7 +108,9 @@ def with_rigid_legs(clip: Clip) -> Clip:
 
 
 def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = AS_FOUND) -> Clip:
-    """The animation in a file, ready for foot IK: with rigid legs, and of a blocks file the base.
+    """The animation in a file, ready for foot IK, with rigid legs.
+
+    Of a file that holds a captured clip and the flat animation below it, the latter.
 
     Args:
         path: the file.
@@ -118,8 +120,11 @@ def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = A
     Raises:
         ValueError: as `load_clip`, or the clip has no legs.
     """
-    variant = "base" if is_blocks_file(path) else "captured"
-    clip = load_clip(path, variant=variant, **vars(options))
+    if holds_base(path):
+        options.check_use([path], str(path))
+        clip = read_base(path)
+    else:
+        clip = load_clip(path, **vars(options))
     with error_context(path):
         return as_flat_animation(clip, floor, options.sole)
 

@@ -27,7 +27,7 @@ import jaxik
 from fitting.clips import Clip, load_clip
 from fitting.clips.clip_frames import clip_from_result, frames_from_clip, positions_by_role, raised
 from fitting.clips.edit import at_speed
-from fitting.clips.formats.npz import is_blocks_file
+from fitting.clips.formats.npz import holds_base
 from fitting.clips.joint_maps import find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
@@ -261,12 +261,12 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
 def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:
     """The captured motion of an animation, where the file of the clip has it.
 
-    A file of the blocks benchmark does, and so does a clip that follows the terrain, from which the
-    ground was taken out. At another speed neither goes where it was captured.
+    It may hold both motions, or a clip that follows the terrain, from which the ground was taken
+    out. At another speed neither goes where it was captured.
     """
     if files.speed != 1.0:
         return None
-    if is_blocks_file(files.clip):
+    if holds_base(files.clip):
         return load_clip(files.clip)
     return None if placed is files.flat_clip else files.flat_clip
 

@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 import jaxik
-from fitting.clips import Clip, load_clip
+from fitting.clips import Clip
 from fitting.clips.clip_frames import raised
 from fitting.clips.edit import at_speed
-from fitting.clips.formats.npz import is_blocks_file
 from fitting.experiment import problems, systems
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.problems import ClipData
@@ -203,8 +202,8 @@ def subject_of_animation(
     terrain = first.probe.prepare(loaded.terrain)
     tracks = {name: jnp.asarray(values) for name, values in loaded.tracks.items()}
     captured = cost = None
-    if is_blocks_file(files.clip) and files.speed == 1.0:
-        captured = with_soles_of(load_clip(files.clip), loaded.clip)
+    if loaded.captured is not None:
+        captured = with_soles_of(loaded.captured, loaded.clip)
         if files.floor == 0.0:  # a scene knows no other
             data = ClipData(captured, loaded.clip, terrain, loaded.root, loaded.tracks)
             cost = partial(cost_of_scenes, (problems.make_scene(data, {}),))

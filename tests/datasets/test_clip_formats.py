@@ -16,6 +16,9 @@ from fitting.clips.clip import INCH, Y_UP_FROM_Z_UP, Recording
 from fitting.clips.edit import mask_marker_jumps
 from fitting.clips.formats.asfamc import read_asfamc
 from fitting.clips.formats.bvh import read_bvh
+from fitting.clips.formats.npz import holds_base, read_base
+from fitting.clips.load import ClipOptions
+from fitting.motion.flat_animation import load_flat_animation
 from fitting.synthetic import multi_limb, walker
 from support.sample_clips import AMC, AMC_FILES, ASF, BVH, BVH_FILES, stair_walk
 
@@ -236,7 +239,6 @@ def test_what_no_body_or_argument_can_be_is_refused_but_bounds_give_way_to_argum
         ("", "", {"scale": -1.0}, "scale is -1"),
         ("", "", {"fps": 0.0}, "fps is 0"),
         ("", "", {"up": "x"}, "wanted 'y'"),
-        ("", "", {"variant": "base"}, "variant 'base'"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             load_clip(write_bvh(BVH.replace(old, new, 1)), **arguments)  # pyright: ignore[reportArgumentType]
@@ -388,7 +390,7 @@ def test_errors_in_a_skeleton_or_motion_name_file_and_line(pair):
             read_asfamc(*pair(ASF.replace(old, new, 1), AMC.replace(old, new, 1)))
 
 
-# NumPy archives: saved clips, and files of the blocks benchmark
+# NumPy archives: saved clips, and joint positions
 
 
 ROLES = ("hip", "knee", "ankle", "ball")
@@ -451,12 +453,8 @@ def test_a_clip_is_loaded_as_it_was_saved_or_not_saved_at_all(walk, path, monkey
 def test_archives_that_are_not_clips_are_refused(walk, path):
     save_clip(path, walk)
     content = dict(np.load(path))
-    for options, message in (
-        ({"variant": "base"}, "only blocks files have the variant 'base'"),
-        ({"fps": 30.0}, r"\['fps'\] do not apply"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            load_clip(path, **options)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"\['fps'\] do not apply"):
+        load_clip(path, fps=30.0)
     nowhere = content["positions_ws"].copy()
     nowhere[3, 2, 1] = np.nan
     for arrays, message in (
@@ -473,8 +471,8 @@ def test_archives_that_are_not_clips_are_refused(walk, path):
         load_clip(path)
 
 
-def blocks(walk) -> dict[str, np.ndarray]:
-    """The walk as a blocks file whose base is the same motion 10 cm lower."""
+def positions(walk) -> dict[str, np.ndarray]:
+    """The walk as joint positions, with the same motion 10 cm lower as its flat animation."""
     arrays = {"fps": np.array(walk.fps), "stance": walk.stance, "leg_lengths": np.ones((2, 2))}
     arrays["pelvis_rot"] = walk.rotations_ws[:, 0].astype(np.float32)
     arrays["foot_rot"] = walk.rotations_ws[:, [3, 7]].astype(np.float32)
@@ -485,29 +483,34 @@ def blocks(walk) -> dict[str, np.ndarray]:
     return arrays
 
 
-def test_a_blocks_file_has_a_captured_clip_and_a_base(walk, path):
-    write(path, blocks(walk))
-    for variant, lower in (("captured", 0.0), ("base", 0.1)):
-        clip = load_clip(path, variant=variant)
+def test_an_archive_of_positions_has_a_captured_clip_and_a_flat_animation(walk, path):
+    write(path, positions(walk))
+    assert holds_base(path)
+    for load, lower in ((load_clip, 0.0), (read_base, 0.1)):
+        clip = load(path)
         assert np.allclose(clip.positions_ws, walk.positions_ws - [0, lower, 0], atol=1e-12)
         assert np.abs(np.sum(clip.rotations_ws * walk.rotations_ws, axis=-1)).min() > 1 - 1e-12
         assert np.array_equal(clip.stance_labels(), walk.stance_labels())
         assert np.allclose(clip.rig.knee_axis_ls, [-1, 0, 0], atol=1e-9)
-    with pytest.raises(ValueError, match=r"no variant 'flat'; there are \['captured', 'base'\]"):
-        load_clip(path, variant="flat")
+    with pytest.raises(ValueError, match="clip.npz: scale is of no use: an .npz states all but"):
+        load_flat_animation(path, options=ClipOptions(scale=0.01))
     for change, message in (
         ({"knee": walk.joints_ws(1)[:5]}, r"knee is \(5, 2, 3\); wanted"),
         ({"foot_rot": None}, r"without the arrays \['foot_rot'\]"),
     ):
-        write(path, blocks(walk) | change)
+        write(path, positions(walk) | change)
         with pytest.raises(ValueError, match=message):
             load_clip(path)
+    alone = {key: a for key, a in positions(walk).items() if not key.startswith("base_")}
+    write(path, alone)
+    assert not holds_base(path)
+    assert np.array_equal(load_flat_animation(path).positions_ws, load_clip(path).positions_ws)
 
 
 def test_the_blocks_benchmark_is_loaded_unchanged(mocap):
     raw = np.load(mocap / "blocks/03_03.npz")
-    for variant, prefix in (("captured", ""), ("base", "base_")):
-        clip = load_clip(mocap / "blocks/03_03.npz", variant=variant)
+    for load, prefix in ((load_clip, ""), (read_base, "base_")):
+        clip = load(mocap / "blocks/03_03.npz")
         assert np.array_equal(clip.positions_ws[:, 0], raw[f"{prefix}pelvis"])
         for role, name in enumerate(ROLES):
             assert np.array_equal(clip.joints_ws(role), raw[prefix + name])

@@ -159,7 +159,7 @@ def capture_bytes() -> bytes:
 
 
 def blocks_archive() -> bytes:
-    """A file of the `blocks` benchmark, of a character that stands."""
+    """Joint positions of a character that stands."""
     frames, upright = 12, [1.0, 0.0, 0.0, 0.0]
     arrays: dict[str, np.ndarray] = {"fps": np.array(30.0), "stance": np.ones((frames, 2), int)}
     arrays |= {"pelvis_rot": np.tile(upright, (frames, 1))}

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import house
 from fitting.cli import main
 from fitting.clips import load_clip, save_clip
-from fitting.clips.formats.npz import is_blocks_file
+from fitting.clips.formats.npz import holds_base
 from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment, parse_experiment
 from fitting.ground.meshes import load_terrain
@@ -46,7 +46,7 @@ def test_nothing_is_unpickled(name, tmp_path):
         for load in (load_clip, load_terrain):
             with pytest.raises(ValueError, match="file.npz: wanted a NumPy archive of plain arra"):
                 load(path)
-    is_blocks_file(path)
+    holds_base(path)
     assert not target.exists()
     with np.load(path, allow_pickle=True) as archive:  # it would work
         archive[name]

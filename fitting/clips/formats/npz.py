@@ -1,7 +1,7 @@
-"""Clips as NumPy archives: this project's own format, and the files of the `blocks` benchmark.
+"""Clips as NumPy archives: of all fields of a `Clip`, or of the joint positions of two legs.
 
-An archive of our own holds every field of a `Clip`, so it loads exactly as it was saved. A `blocks`
-file holds joint positions of two legs, once as captured and once as a flat animation.
+An archive of fields loads exactly as it was saved. One of positions may hold two motions, as
+captured and, with `BASE` before the names of its arrays, the flat animation below it.
 """
 
 import math
@@ -44,8 +44,8 @@ ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
 OPTIONAL = ("dialect", "rest_rotations_ls", "channels")
-VARIANTS = {"captured": "", "base": "base_"}  # prefix of their arrays in a blocks file
-BLOCKS_JOINTS = ("hip", "knee", "ankle", "ball")
+BASE = "base_"
+LEG_JOINTS = ("hip", "knee", "ankle", "ball")
 
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 MAX_BYTES = 2**31  # of all arrays together, unpacked
@@ -185,14 +185,14 @@ CLIP_ARRAYS = {
     "channels": Wanted("text", ("joints",), optional=True),
     **TRACK_ARRAYS,
 }
-BLOCKS_ARRAYS = {
+POSITION_ARRAYS = {
     "fps": FPS,
     "pelvis_rot": Wanted("number", ("frames", 4), unit=True),
     "foot_rot": Wanted("number", ("frames", 2, 4), unit=True),
     "stance": Wanted("label", ("frames", 2)),
 }
-BLOCKS_ROOT = Wanted("number", ("frames", 3), low=-FURTHEST, high=FURTHEST)
-BLOCKS_JOINT = Wanted("number", ("frames", 2, 3), low=-FURTHEST, high=FURTHEST)
+ROOT_POSITIONS = Wanted("number", ("frames", 3), low=-FURTHEST, high=FURTHEST)
+LEG_POSITIONS = Wanted("number", ("frames", 2, 3), low=-FURTHEST, high=FURTHEST)
 
 
 def write_npz(path: Path, clip: Clip, joints: Mapping[str, np.ndarray]) -> None:
@@ -227,34 +227,37 @@ def write_npz(path: Path, clip: Clip, joints: Mapping[str, np.ndarray]) -> None:
     files.write(path, fill)
 
 
-def read_npz(path: Path, variant: str) -> Clip:
-    """The clip in an archive.
+def read_npz(path: Path) -> Clip:
+    """The clip in an archive, as captured where it holds a flat animation, too.
 
     Args:
-        path: an archive written by `write_npz`, or a `blocks` file.
-        variant: of a `blocks` file: "captured" or "base".
+        path: an archive written by `write_npz`, or one of joint positions.
 
     Raises:
-        ValueError: neither kind of file, arrays missing, misshapen or not finite, or no such
-            variant.
+        ValueError: neither kind of file, or arrays missing, misshapen or not finite.
     """
     content = read_arrays(path)
     if "format" in content:
-        if variant != "captured":
-            raise ValueError(f"{path}: only blocks files have the variant {variant!r}")
         return _read_saved_clip(path, content)
-    if "base_pelvis" in content or "leg_lengths" in content:
-        if variant not in VARIANTS:
-            raise ValueError(f"{path}: no variant {variant!r}; there are {list(VARIANTS)}")
-        return _read_blocks(path, content, variant)
+    if "pelvis_rot" in content:
+        return _read_positions(path, content, "")
     raise ValueError(
-        f"{path}: wanted a clip saved by save_clip or a blocks file; it has {sorted(content)}"
+        f"{path}: wanted a clip saved by save_clip, or joint positions; it has {sorted(content)}"
     )
 
 
-def is_blocks_file(path: str | Path) -> bool:
-    """Whether a file belongs to the `blocks` benchmark, with a captured clip and its flat base."""
-    return Path(path).suffix.lower() == ".npz" and "base_pelvis" in array_names(Path(path))
+def read_base(path: Path) -> Clip:
+    """The flat animation that an archive holds below its captured clip; see `holds_base`.
+
+    Raises:
+        ValueError: arrays are missing, misshapen or not finite.
+    """
+    return _read_positions(path, read_arrays(path), BASE)
+
+
+def holds_base(path: str | Path) -> bool:
+    """Whether a file holds a captured clip and the flat animation below it."""
+    return Path(path).suffix.lower() == ".npz" and f"{BASE}pelvis" in array_names(Path(path))
 
 
 def _read_saved_clip(path: Path, content: Arrays) -> Clip:
@@ -340,12 +343,11 @@ def _measure_soles(content: Arrays, rig: Rig) -> Rig:
     return with_soles(rig, positions_ws, content["rotations_ws"], stance)
 
 
-def _read_blocks(path: Path, content: Arrays, variant: str) -> Clip:
+def _read_positions(path: Path, content: Arrays, prefix: str) -> Clip:
     """Joint positions of two legs, left first; thigh and shin get the rotations they imply."""
-    prefix = VARIANTS[variant]
-    keys = [f"{prefix}{joint}" for joint in BLOCKS_JOINTS]
-    joints = {f"{prefix}pelvis": BLOCKS_ROOT, **dict.fromkeys(keys, BLOCKS_JOINT)}
-    check_arrays(path, content, joints | BLOCKS_ARRAYS)
+    keys = [f"{prefix}{joint}" for joint in LEG_JOINTS]
+    joints = {f"{prefix}pelvis": ROOT_POSITIONS, **dict.fromkeys(keys, LEG_POSITIONS)}
+    check_arrays(path, content, joints | POSITION_ARRAYS)
     pelvis = content[f"{prefix}pelvis"].astype(np.float64)
     hip, knee, ankle, ball = (content[key].astype(np.float64) for key in keys)
     pelvis_rot = _normalised(content["pelvis_rot"])
