@@ -1,7 +1,7 @@
-"""How far a solved motion is from the captured one, in the figures of the blocks benchmark.
+"""How far a solved motion is from the captured one.
 
-The definitions are those of the benchmark's own scoring script, against which the tests check
-them. NumPy; world space, y up.
+The definitions are those of a benchmark's scoring script, against which the tests check them, so
+that figures compare. NumPy; world space, y up.
 
 How far a system's motion is from its reference, and how much of the reference it reproduces.
 
@@ -26,7 +26,9 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.world.skeleton import Transform
 
-STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
+from .measures import MEASURES, Figures, declared, knee_angle, straight
+
+_IN_STANCE = "The same over the frames in which the foot stands."
 JOINTS = ("pelvis", "hip", "knee", "ankle")
 
 STANDING_SPEED = 0.02  # m/s; a slower character stands
@@ -37,31 +39,44 @@ FITTED_JOINTS = ("pelvis", "knee", "ankle")
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class Accuracy(Figures):
     """How far a solved motion is from the captured one; NaN where no frame counts."""
 
-    pelvis: float
-    """m, height, rms."""
-    ankle: float
-    """m, rms."""
-    ankle_stance: float
-    """m, rms over the frames in which the captured foot stands."""
-    knee: float
-    """m, rms."""
-    knee_stance: float
-    """m, likewise."""
-    knee_angle: float
-    """rad, rms."""
-    knee_angle_stance: float
-    """rad, likewise."""
-    straight: float
-    """Fraction of frames and legs."""
-    pop: float
-    """m per frame, largest."""
-    added_slip: float
-    """m per frame, mean."""
-    bone_length: float
-    """m, largest error."""
+    pelvis: float = declared(
+        "pelvis", "cm", 2,
+        "Difference in height between the solved and the captured pelvis; rms over frames.",
+    )  # fmt: skip
+    ankle: float = declared(
+        "ankle", "cm", 2, "Distance between solved and captured ankles; rms over frames and legs."
+    )
+    ankle_stance: float = declared("ankle in stance", "cm", 2, _IN_STANCE)
+    knee: float = declared(
+        "knee", "cm", 2, "Distance between solved and captured knees; rms over frames and legs."
+    )
+    knee_stance: float = declared("knee in stance", "cm", 2, _IN_STANCE)
+    knee_angle: float = declared(
+        "knee angle", "°", 2,
+        "Difference between solved and captured knee angles; rms over frames and legs.",
+    )  # fmt: skip
+    knee_angle_stance: float = declared("knee angle in stance", "°", 2, _IN_STANCE)
+    straight: float = declared("straight legs", "%", 2, MEASURES["straight"].meaning)
+    lift_change: float = declared(
+        "lift", "cm a frame", 2,
+        "Largest change, from one frame to the next, of an ankle's height over the animated "
+        "ankle. It grows with the duration of a frame.",
+        formerly="pop",
+    )  # fmt: skip
+    added_slip: float = declared(
+        "added slip", "mm a frame", 3,
+        "How much further a standing ankle moves horizontally, from one frame to the next, than "
+        "the captured one; mean, where frames in which it moves less count as 0.",
+    )  # fmt: skip
+    bone_length: float = declared(
+        "bone length", "mm", 3, "Largest error in the length of a thigh or a shin."
+    )  # fmt: skip
+
+
+ACCURACY = Accuracy.measures()
 
 
 @dataclass(frozen=True)
@@ -110,14 +125,16 @@ def errors(
         for joints in (ours, theirs)
     )
     thigh, shin = ours["knee"] - ours["hip"], ours["ankle"] - ours["knee"]
-    reach = np.linalg.norm(ours["ankle"] - ours["hip"], axis=-1)
+    our_angle, their_angle = (
+        knee_angle(joints["hip"], joints["knee"], joints["ankle"]) for joints in (ours, theirs)
+    )
     return Errors(
         pelvis=ours["pelvis"][:, 1] - theirs["pelvis"][:, 1],
         ankle=np.linalg.norm(ours["ankle"] - theirs["ankle"], axis=-1),
         knee=np.linalg.norm(ours["knee"] - theirs["knee"], axis=-1),
-        knee_angle=knee_angle(ours) - knee_angle(theirs),
+        knee_angle=our_angle - their_angle,
         stance=stance,
-        straight=reach / np.sum(lengths, axis=-1) >= STRAIGHT_REACH,
+        straight=straight(ours["hip"], ours["ankle"], lengths),
         lift=np.diff((ours["ankle"] - animated_ankle_ws)[..., 1], axis=0),
         slip=(our_steps - their_steps)[stance[1:] & stance[:-1]],
         bones=np.linalg.norm(np.stack([thigh, shin], axis=2), axis=-1) - lengths,
@@ -142,13 +159,6 @@ def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
     )
 
 
-def knee_angle(joints: Mapping[str, np.ndarray]) -> Float[np.ndarray, "frames legs"]:
-    """Angle between thigh and shin, rad; pi for a straight leg."""
-    thigh, shin = joints["hip"] - joints["knee"], joints["ankle"] - joints["knee"]
-    across = np.linalg.norm(np.cross(thigh, shin), axis=-1)
-    return np.arctan2(across, np.sum(thigh * shin, axis=-1))
-
-
 def summarise(clips: Sequence[Errors]) -> Accuracy:
     """The figures over all frames of all clips; no change is taken across a cut."""
     joined = {
@@ -165,7 +175,7 @@ def summarise(clips: Sequence[Errors]) -> Accuracy:
         knee_angle=_rms(joined["knee_angle"]),
         knee_angle_stance=_rms(joined["knee_angle"][stance]),
         straight=_mean(joined["straight"]),
-        pop=_largest(joined["lift"]),
+        lift_change=_largest(joined["lift"]),
         added_slip=_mean(np.maximum(joined["slip"], 0.0)),
         bone_length=_largest(joined["bones"]),
     )

@@ -1,14 +1,15 @@
-"""How the feet of a motion are placed on its ground: what a viewer sees of it, frame by frame.
+"""What a viewer sees of a motion on its ground: each measure with its unit, definition and bound.
 
 NumPy; lengths in metres, y up. The sole of a foot is known at two points: below the ankle, which
 stands for the heel, and below the ball. Each is as far below its joint, along the foot's up axis,
 as the joint is above the floor while the animated foot stands flat. What is visible is as large as
-the body: limits are for an adult.
+the body: lengths that count are for an adult.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -22,18 +23,13 @@ from jaxik.world import body
 from jaxik.world.frame import UP
 from jaxik.world.terrain import Terrain
 
-from .playback import Motion
-
-VISIBLE = 0.02  # m: what a viewer notices of a sole in the ground or above it
-SHARE_LIMIT = 0.05  # of the frames of standing feet that may be visibly off the ground
-MISSING_LIMIT = 0.5  # of the points of soles that may be without ground
-SLIDE_LIMIT = 0.02  # m per stance, median
-POP_LIMIT = 0.05  # m in 1/60 s
-
-STRAIGHT_KNEE = np.radians(175.0)  # rad; a larger knee angle counts as straight
+VISIBLE = 0.02  # m: what a viewer notices of a sole off its ground, of a slide and of a pop
 TICK = 1.0 / 60.0  # s, the time over which a pop is measured
-POP = 0.02  # m in a tick; a correction that changes faster is a pop
-
+STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
+LEVEL = 1e-3  # m, between the heights of ground that counts as a level floor
+MISSING = 0.5  # of the points of soles that may be without ground
+FLAT_SLIDE = 0.002  # m, the bound of slides on a level floor, where nothing has to move a foot
+SWING_PEAK = 1.875  # speed of a path of minimum jerk at its middle, over its mean speed
 
 CLOSE = 0.1  # relative difference from a factor
 CORRELATED = 0.8  # of heights, from which one counts as proportional to the other
@@ -41,12 +37,260 @@ CONSTANT = 0.25  # of the mean, deviation below which heights count as equal
 HELPED = 0.5  # of the gaps that a remedy leaves at most, on average
 
 SOLES = ("ankle_height", "ball_height", "ankle_from_foot")  # of a rig: where the soles are
+SHOWN_PER_UNIT = {"%": 100.0, "cm": 100.0, "mm": 1000.0, "°": math.degrees(1.0)}
+_SEEN = f"{100 * VISIBLE:.0f} cm or more"
+
+
+class Extreme(NamedTuple):
+    """The largest value of a series, and where it is."""
+
+    value: float
+    """m; NaN where there is nothing to measure."""
+    frame: int
+    leg: str
+
+    def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "–"
+        return f"{100 * self.value:z.1f} cm, {self.leg}, frame {self.frame}"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A word for something that is measured of a motion."""
+
+    heading: str
+    unit: str
+    """In which it is shown."""
+    digits: int
+    """After the decimal point."""
+    meaning: str
+    """Its definition."""
+    bound: float = math.nan
+    """Largest value that is good enough, of an adult; NaN where there is none. See `bounds`."""
+    reason: str = ""
+    """Of the bound."""
+    is_least: bool = False
+    """Whether the bound is the smallest value."""
+
+    @property
+    def factor(self) -> float:
+        """Shown value / value in SI units, radians and fractions of 1."""
+        return SHOWN_PER_UNIT.get(self.unit.split()[0], 1.0)
+
+    @property
+    def title(self) -> str:
+        """The heading with the unit."""
+        return f"{self.heading}, {self.unit}"
+
+    def format(self, value: float) -> str:
+        """The value in its unit; a dash for NaN."""
+        return "–" if math.isnan(value) else f"{self.factor * value:z.{self.digits}f}"
+
+    def limit(self, bound: float) -> str:
+        """A bound in the unit."""
+        return f"{'≥' if self.is_least else '≤'} {self.format(bound)}"
+
+    def excess(self, value: float, bound: float) -> float:
+        """How many times what is allowed the value is: above 1 it is beyond its bound."""
+        return (1.0 - value) / (1.0 - bound) if self.is_least else value / bound
+
+
+def declared(
+    heading: str, unit: str, digits: int, meaning: str, *, formerly: str = "", **bound: Any
+) -> Any:
+    """A field of `Figures`, declared by the arguments of `Measure`.
+
+    Args:
+        heading: and what follows, as `Measure` has it.
+        unit: likewise.
+        digits: likewise.
+        meaning: likewise.
+        formerly: its name in the files of earlier releases.
+        bound: likewise, with its reason.
+    """
+    measure = Measure(heading, unit, digits, meaning, **bound)
+    return field(metadata={"measure": measure} | ({"formerly": formerly} if formerly else {}))
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is measured of a motion: SI units, radians and fractions of 1; NaN where unknown."""
+
+    @classmethod
+    def measures(cls) -> dict[str, Measure]:
+        """What is declared of each, by name."""
+        return {f.name: f.metadata["measure"] for f in fields(cls) if "measure" in f.metadata}
+
+    def text(self, name: str) -> str:
+        """A figure in its unit."""
+        return self.measures()[name].format(getattr(self, name))
+
+    def numbers(self) -> dict[str, Any]:
+        """All figures as JSON holds them: null for NaN."""
+        return _without_nan(asdict(self))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Extreme):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {key: _without_nan(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+@dataclass(frozen=True)
+class Measures(Figures):
+    """What a viewer sees of one motion on its ground."""
+
+    penetration: float = declared(
+        "penetration", "% of frames", 1,
+        f"Frames in which a sole is {_SEEN} in the ground.",
+        bound=0.05,
+        reason="deeper soles are seen; in 5 % of the frames that passes",
+    )  # fmt: skip
+    penetration_stance: float = declared(
+        "penetration of standing feet", "% of frames", 1, "The same of each standing foot."
+    )
+    penetration_swing: float = declared(
+        "penetration of moving feet", "% of frames", 1, "The same of each moving foot."
+    )
+    penetration_depth: float = declared(
+        "penetration depth", "cm", 2,
+        "Depth of a foot in the ground, 0 above it; mean over all frames and feet. It is the "
+        "deeper of two points of the sole, one below the ankle and one below the ball (the toe "
+        "joint), each as far below its joint, along the foot's up axis, as the joint is above the "
+        "floor while the animated foot stands flat.",
+    )  # fmt: skip
+    floating: float = declared(
+        "floating", "% of frames", 1,
+        f"Frames of each standing foot in which its sole is {_SEEN} above the ground.",
+    )  # fmt: skip
+    floating_height: float = declared(
+        "floating height", "cm", 2,
+        "Height above the ground of the lower of the same two points of a standing foot, 0 in the "
+        "ground; mean over its frames.",
+    )  # fmt: skip
+    contact: float = declared(
+        "contact preservation", "% of frames", 1,
+        "Frames of each standing foot with ground under it in which it neither floats nor "
+        "penetrates.",
+        bound=0.95, is_least=True,
+        reason="a foot that the animation has standing should be seen to stand, but for 5 % of "
+        "its frames",
+    )  # fmt: skip
+    groundless: float = declared(
+        "without ground", "% of soles", 1,
+        "Points of soles that have no ground under them.",
+    )  # fmt: skip
+    slide: float = declared(
+        "slide", "cm a stance", 2,
+        "Length of the horizontal path of the ball of the foot in a stance, beyond that of the "
+        "animated one; median.",
+        bound=VISIBLE,
+        reason="further slides are seen; on a level floor, where nothing has to move a foot, "
+        f"{1000 * FLAT_SLIDE:.0f} mm",
+    )  # fmt: skip
+    pop: float = declared(
+        "pop", "cm in 1/60 s", 1,
+        "Largest change, over 1/60 s, of an ankle's correction: of its place relative to the "
+        "pelvis, less that of the animated one. Where frames are longer, the change over a frame "
+        "is scaled to 1/60 s.",
+        bound=VISIBLE,
+        reason="larger changes are seen, beyond what a smooth swing from one foothold to the next "
+        "needs on this ground",
+    )  # fmt: skip
+    pops: float = declared(
+        "pops", "count", 0,
+        f"How often a correction changes by more than {100 * VISIBLE:.0f} cm in 1/60 s. "
+        "Consecutive frames above that speed count as one pop.",
+    )  # fmt: skip
+    knee_jerk: float = declared(
+        "knee jerk", "rad/s³", 0,
+        "Third derivative of the knee angle, by differences of four consecutive frames; root mean "
+        "square. It grows with the frame rate of a clip.",
+    )  # fmt: skip
+    pelvis_jerk: float = declared(
+        "pelvis jerk", "m/s³", 0,
+        "The same of the height of the pelvis.",
+        bound=80.0,
+        reason="beyond that of the animation; as much as a walk over a level floor has itself",
+    )  # fmt: skip
+    reached: float = declared(
+        "reached", "% of targets", 1,
+        "Targets of standing feet with ground under them that ankles miss by less than 5 mm (of "
+        "an adult).",
+        bound=0.95, is_least=True,
+        reason="feet stand where their targets are",
+    )  # fmt: skip
+    straight: float = declared(
+        "straight legs", "%", 1,
+        f"Frames of each leg in which its ankle is {100 * STRAIGHT_REACH:g} % of the leg's length "
+        "from its hip, or further.",
+    )  # fmt: skip
+    worst: Mapping[str, Extreme] = field(default_factory=dict)
+    """Where a measure is worst, m, by name."""
+    size: float = 1.0
+    """Length of the legs relative to an adult's."""
+
+    @property
+    def visible(self) -> float:
+        """What a viewer notices of a sole in the ground of this body or above it, m."""
+        return VISIBLE * self.size
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether standing feet are visibly off the ground too often, or have none."""
+        return self.contact < MEASURES["contact"].bound or self.groundless > MISSING
+
+    def text(self, name: str) -> str:
+        """A figure in its unit, with where it is worst."""
+        return " · ".join(filter(None, [super().text(name), str(self.worst.get(name, ""))]))
+
+    def against(self, limits: Mapping[str, float]) -> "list[Bounded]":
+        """What is known of these measures beside their bounds, the worst first.
+
+        Args:
+            limits: by name, as `bounds` gives them.
+        """
+        known = [self._bounded(name, limit) for name, limit in limits.items()]
+        return sorted(
+            (entry for entry in known if not math.isnan(entry.excess)), key=lambda e: -e.excess
+        )
+
+    def _bounded(self, name: str, limit: float) -> "Bounded":
+        measure, value = MEASURES[name], getattr(self, name)
+        words = f"{measure.heading} {measure.format(value)} {measure.unit} ({measure.limit(limit)})"
+        if name in self.worst:
+            words += f", worst {self.worst[name]}"
+        return Bounded(name, measure.excess(value, limit), words)
+
+
+class Bounded(NamedTuple):
+    """A measure beside its bound."""
+
+    name: str
+    excess: float
+    """How many times what is allowed it is: above 1 it is beyond its bound."""
+    words: str
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the measure is beyond its bound."""
+        return self.excess > 1.0
+
+
+MEASURES = Measures.measures()
+BOUNDED = {name: measure for name, measure in MEASURES.items() if measure.reason}
+NOISY = ("pelvis_jerk",)  # to which a capture's noise adds: bounded in made animations only
 
 
 @dataclass(frozen=True)
 class Soles:
     """Both points of each sole over the ground; see the module."""
 
+    points_ws: Float64[np.ndarray, "frames legs 2 3"]
+    """m."""
     height: Float64[np.ndarray, "frames legs 2"]
     """m above the ground, negative in it; NaN where there is no ground, and in masked frames."""
     ground: Float64[np.ndarray, "frames legs 2"]
@@ -61,208 +305,53 @@ class Soles:
 
 
 @dataclass(frozen=True)
-class Extreme:
-    """The largest value of a series, and where it is."""
+class PlacedMotion:
+    """A motion on its ground, and what a viewer sees of it."""
 
-    value: float
-    """NaN where there is nothing to measure."""
-    frame: int
-    leg: str
-
-
-@dataclass(frozen=True)
-class Placement:
-    """How the feet of one motion are placed; NaN where there is nothing to measure."""
-
-    sunk: float
-    """Fraction of the frames of standing feet in which one is `visible` or more in the ground."""
-    floating: float
-    """Fraction of those in which it is `visible` or more above it."""
-    sunk_swing: float
-    """Fraction of the frames of moving feet in which one is `visible` or more in the ground."""
-    sunk_frames: float
-    """Fraction of all frames in which any foot is."""
-    groundless: float
-    """Fraction of the soles' points, over all frames, that have no ground under them."""
-    deepest: Extreme
-    """m in the ground, of any foot."""
-    highest: Extreme
-    """m above it, of a standing foot."""
-    slide: float
-    """m per stance, horizontal path of the ball beyond the animated one; median."""
-    largest_slide: Extreme
-    """m; its frame is the first of the stance."""
-    pop: Extreme
-    """m in 1/60 s, change of the ankle's place relative to the body, beyond the animated one."""
-    size: float = 1.0
-    """Length of the legs relative to an adult's: limits are as many times as large."""
+    clip: Clip
+    soles: Soles
+    measures: Measures
 
     @property
-    def visible(self) -> float:
-        """What a viewer notices of a sole in the ground of this body or above it, m."""
-        return VISIBLE * self.size
-
-    @property
-    def misplaced(self) -> bool:
-        """Whether standing feet are visibly off the ground too often, or have none."""
-        return self.sunk + self.floating > SHARE_LIMIT or self.groundless > MISSING_LIMIT
+    def in_ground(self) -> Bool[np.ndarray, "frames legs"]:
+        """Where a sole is visibly in the ground."""
+        return self.soles.gap < -self.measures.visible
 
 
-def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) -> Soles:
-    """The soles of a motion over a terrain.
-
-    The ground is looked for from `step_height` above the sole or the ground of the path, whichever
-    is higher: a character inside a hill is found to be in it, and a roof is no ground.
+def place(
+    solved: Clip,
+    animated: Clip,
+    flat: Clip,
+    terrain: Terrain,
+    floor: float = 0.0,
+    reached: Float64[np.ndarray, "frames legs"] | None = None,
+) -> PlacedMotion:
+    """A motion with its soles over the terrain, and what is measured of it.
 
     Args:
         solved: the motion.
-        animated: the flat animation from which it was made, on its own floor.
+        animated: the animation from which it was made, with its root where the motion has it.
+        flat: the animation on its own floor, with its root at the speed at which it steps.
         terrain: y up.
         floor: height of that floor, m.
+        reached: 1 or 0 for the target of each ankle, NaN where there is none; None if unknown.
+    """
+    feet = soles(solved, flat, terrain, floor)
+    return PlacedMotion(solved, feet, measure(feet, solved, animated, flat, reached))
+
+
+def soles(solved: Clip, flat: Clip, terrain: Terrain, floor: float = 0.0) -> Soles:
+    """The soles of a motion over a terrain; see `place`.
+
+    The ground is looked for from `step_height` above the sole or the ground of the path, whichever
+    is higher: a character inside a hill is found to be in it, and a roof is no ground.
     """
     points = sole_points(solved)
     path = ground_path.path_heights(solved, terrain, floor)
     lowest = points[..., 1] if path is None else np.maximum(points[..., 1], path[:, None, None])
-    ground = ground_path.heights_under(terrain, points, lowest + ground_path.step_height(animated))
-    height = np.where(animated.observed[:, None, None], points[..., 1] - ground, np.nan)
-    return Soles(height, ground, animated.observed_stances())
-
-
-def assess(feet: Soles, solved: Clip, animated: Clip, own_speed: Clip | None = None) -> Placement:
-    """What a viewer sees of the feet of a motion.
-
-    Args:
-        feet: of the motion.
-        solved: the motion.
-        animated: the animation from which it was made, with its root where the motion has it.
-        own_speed: the animation with its root at the speed at which it steps, whose slides are not
-            counted; None if it has that speed.
-    """
-    names, gap, stance = solved.rig.names, feet.gap, feet.stance
-    size = body.ratio(solved.rig)
-    in_ground, above = gap < -VISIBLE * size, gap > VISIBLE * size  # false for NaN
-    known = ~np.isnan(gap)
-    slides = _slides(solved, stance) - _slides(own_speed or animated, stance)
-    stances = slides[~np.isnan(slides)]
-    return Placement(
-        sunk=_fraction(in_ground, stance & known),
-        floating=_fraction(above, stance & known),
-        sunk_swing=_fraction(in_ground, ~stance & known),
-        sunk_frames=_fraction(np.any(in_ground, axis=1), np.any(known, axis=1)),
-        groundless=float(np.mean(np.isnan(feet.ground))),
-        deepest=_extreme(-gap, names),
-        highest=_extreme(np.where(stance, gap, np.nan), names),
-        slide=float(np.median(stances)) if stances.size else float("nan"),
-        largest_slide=_extreme(slides, names),
-        pop=_extreme(_pops(solved, animated), names),
-        size=size,
-    )
-
-
-def _slides(
-    clip: Clip, stance: Bool[np.ndarray, "frames legs"]
-) -> Float64[np.ndarray, "frames legs"]:
-    """Length of the ball's horizontal path in each stance, m, at its first frame; NaN elsewhere."""
-    steps = horizontal_steps(clip.joints_ws(3), clip.cuts)
-    slides = np.full(stance.shape, np.nan)
-    for leg in range(stance.shape[1]):
-        for first, last in contacts.runs(stance[:, leg]):
-            if last > first:
-                slides[first, leg] = steps[first:last, leg].sum()
-    return slides
-
-
-def _pops(solved: Clip, animated: Clip) -> Float64[np.ndarray, "frames legs"]:
-    """Change of the ankles' corrections relative to the pelvis, m in 1/60 s, at its last frame."""
-    before, after = (
-        clip.joints_ws(2) - clip.positions_ws[:, clip.rig.pelvis][:, None]
-        for clip in (animated, solved)
-    )
-    speeds = correction_speed(after - before, solved.fps, solved.cuts)
-    pops = np.full(before.shape[:2], np.nan)
-    pops[len(pops) - len(speeds) :] = speeds
-    return pops
-
-
-def _fraction(chosen: np.ndarray, among: np.ndarray) -> float:
-    return float(np.mean(chosen[among])) if among.any() else float("nan")
-
-
-def _extreme(series: Float64[np.ndarray, "frames legs"], names: tuple[str, ...]) -> Extreme:
-    if np.isnan(series).all():
-        return Extreme(float("nan"), 0, names[0])
-    frame, leg = np.unravel_index(np.nanargmax(series), series.shape)
-    return Extreme(float(series[frame, leg]), int(frame), names[leg])
-
-
-@dataclass(frozen=True)
-class Measures:
-    """Measures of one motion; NaN where there is nothing to measure.
-
-    `fitting.report.formatting.MEASURES` defines each of them.
-    """
-
-    penetration_mean: float
-    """Metres."""
-    penetration_max: float
-    """Metres."""
-    clearance: float
-    """Metres."""
-    slide: float
-    """m per stance."""
-    pop_max: float
-    """m in a 60th of a second."""
-    pops: float
-    """Count."""
-    knee_jerk: float
-    """Rad/s³."""
-    pelvis_jerk: float
-    """m/s³."""
-    reached: float
-    """Fraction of targets."""
-    straight: float
-    """Fraction of frames and legs."""
-
-
-@dataclass(frozen=True)
-class FootStates:
-    """What is known of each foot in each frame, beside its joints."""
-
-    gap: Float64[np.ndarray, "frames legs"]
-    """m, see `gaps`; NaN where there is no ground."""
-    stance: Bool[np.ndarray, "frames legs"]
-    """Where the animation says that the foot stands."""
-    reached: Float64[np.ndarray, "frames legs"]
-    """1 or 0; NaN where there is no target."""
-
-
-def measure(
-    motion: Motion, animated: Motion, feet: FootStates, fps: float, cuts: Sequence[int] = ()
-) -> Measures:
-    """All measures of a motion.
-
-    Args:
-        motion: after foot IK.
-        animated: before it.
-        feet: of the motion.
-        fps: frames per second.
-        cuts: frames at which the motion starts anew, as in a teleport; see `Clip.cuts`.
-    """
-    depth = np.maximum(-feet.gap, 0.0)
-    correction = np.asarray(motion.ankle) - np.asarray(animated.ankle)
-    speed = correction_speed(correction, fps, cuts)
-    return Measures(
-        penetration_mean=_mean(depth),
-        penetration_max=_largest(depth),
-        clearance=_mean(np.maximum(feet.gap, 0.0)[feet.stance]),
-        slide=slide_per_stance(np.asarray(motion.toe), feet.stance, cuts),
-        pop_max=_largest(speed),
-        pops=float(sum(len(contacts.runs(leg_speed > POP)) for leg_speed in speed.T)),
-        knee_jerk=jerk(motion.knee_angle, fps, cuts),
-        pelvis_jerk=jerk(np.asarray(motion.pelvis)[:, 1], fps, cuts),
-        reached=_mean(feet.reached),
-        straight=_mean((motion.knee_angle > STRAIGHT_KNEE).astype(float)),
-    )
+    ground = ground_path.heights_under(terrain, points, lowest + ground_path.step_height(flat))
+    height = np.where(flat.observed[:, None, None], points[..., 1] - ground, np.nan)
+    return Soles(points, height, ground, flat.observed_stances())
 
 
 def sole_points(clip: Clip) -> Float64[np.ndarray, "frames legs 2 3"]:
@@ -278,38 +367,83 @@ def sole_points(clip: Clip) -> Float64[np.ndarray, "frames legs 2 3"]:
     return joints - depths[..., None] * up[:, :, None]
 
 
-def gaps(
-    soles_ws: Float64[np.ndarray, "*b 2 3"], ground: Float64[np.ndarray, "*b 2"]
-) -> Float64[np.ndarray, "*b"]:
-    """Height of a foot's lowest point above the ground under it, m; negative in the ground.
-
-    A foot with ground under one of its points is measured there; a foot without ground is NaN.
+def measure(
+    feet: Soles,
+    solved: Clip,
+    animated: Clip,
+    flat: Clip,
+    reached: Float64[np.ndarray, "frames legs"] | None = None,
+) -> Measures:
+    """What is measured of a motion; see `place`.
 
     Args:
-        soles_ws: the points of each foot's sole, world space, m.
-        ground: height of the ground under each point, m; NaN where there is none.
+        feet: of the motion.
+        solved: as `place` has it, like what follows.
+        animated: whose ankles' corrections are none.
+        flat: whose slides do not count.
+        reached: 1 or 0 for each target.
     """
-    return np.fmin.reduce(soles_ws[..., 1] - ground, axis=-1)
+    names, gap, stance = solved.rig.names, feet.gap, feet.stance
+    size = body.ratio(solved.rig)
+    known, visible = ~np.isnan(gap), VISIBLE * size
+    in_ground, above = gap < -visible, gap > visible  # false for NaN
+    slides = _of_stances(travelled(solved, flat, stance))
+    known_slides, speed = slides[~np.isnan(slides)], _pops(solved, animated)
+    hip, knee, ankle = (solved.joints_ws(role) for role in range(3))
+    lengths = np.stack([solved.rig.thigh, solved.rig.shin], axis=-1)
+    pelvis = solved.positions_ws[:, solved.rig.pelvis, 1]
+    standing = np.where(stance, gap, np.nan)
+    return Measures(
+        penetration=_mean(np.any(in_ground, axis=1), np.any(known, axis=1)),
+        penetration_stance=_mean(in_ground, stance & known),
+        penetration_swing=_mean(in_ground, ~stance & known),
+        penetration_depth=_mean(np.maximum(-gap, 0.0), known),
+        floating=_mean(above, stance & known),
+        floating_height=_mean(np.maximum(gap, 0.0), stance & known),
+        contact=_mean(~in_ground & ~above, stance & known),
+        groundless=float(np.mean(np.isnan(feet.ground))),
+        slide=float(np.median(known_slides)) if known_slides.size else math.nan,
+        pop=_extreme(speed, names).value,
+        pops=float(sum(len(contacts.runs(of_leg > visible)) for of_leg in speed.T)),
+        knee_jerk=jerk(knee_angle(hip, knee, ankle), solved.fps, solved.cuts),
+        pelvis_jerk=jerk(pelvis, solved.fps, solved.cuts),
+        reached=math.nan if reached is None else _mean(reached, stance & ~np.isnan(reached)),
+        straight=_mean(straight(hip, ankle, lengths), np.ones(stance.shape, bool)),
+        worst={
+            "penetration": _extreme(-gap, names),
+            "floating": _extreme(standing, names),
+            "contact": _extreme(np.abs(standing), names),
+            "slide": _extreme(slides, names),
+            "pop": _extreme(speed, names),
+        },
+        size=size,
+    )
 
 
-def slide_per_stance(
-    ball_ws: Float[np.ndarray, "frames legs 3"],
-    stance: Bool[np.ndarray, "frames legs"],
-    cuts: Sequence[int] = (),
-) -> float:
-    """Length of the ball's horizontal path in a stance, m; median over the stances of all feet.
+def travelled(
+    motion: Clip, flat: Clip, stance: Bool[np.ndarray, "frames legs"]
+) -> Float64[np.ndarray, "frames legs"]:
+    """How far a ball has gone over the ground since its stance began, beyond the animated one, m.
 
-    Stances of a single frame are left out; NaN where there are no others.
+    NaN in swings.
     """
-    steps = horizontal_steps(ball_ws, cuts)
-    travelled = np.concatenate([np.zeros((1, ball_ws.shape[1])), np.cumsum(steps, axis=0)])
-    slides = [
-        travelled[last, leg] - travelled[first, leg]
-        for leg in range(ball_ws.shape[1])
-        for first, last in contacts.runs(stance[:, leg])
-        if last > first
-    ]
-    return float(np.median(slides)) if slides else float("nan")
+    steps = horizontal_steps(motion.joints_ws(3), motion.cuts)
+    steps = steps - horizontal_steps(flat.joints_ws(3), flat.cuts)
+    path = np.full(stance.shape, np.nan)
+    for leg in range(stance.shape[1]):
+        for first, last in contacts.runs(stance[:, leg]):
+            path[first : last + 1, leg] = np.append(0.0, np.cumsum(steps[first:last, leg]))
+    return path
+
+
+def _of_stances(path: Float64[np.ndarray, "frames legs"]) -> Float64[np.ndarray, "frames legs"]:
+    """The last value of each stance at its first frame; NaN elsewhere, and for single frames."""
+    slides = np.full(path.shape, np.nan)
+    for leg in range(path.shape[1]):
+        for first, last in contacts.runs(~np.isnan(path[:, leg])):
+            if last > first:
+                slides[first, leg] = path[last, leg]
+    return slides
 
 
 def horizontal_steps(
@@ -321,20 +455,26 @@ def horizontal_steps(
     return steps
 
 
-def correction_speed(
-    correction_ws: Float[np.ndarray, "frames legs 3"], fps: float, cuts: Sequence[int] = ()
-) -> Float[np.ndarray, "changes legs"]:
-    """How fast corrections change, m in a `TICK`; NaN where a cut lies between.
+def _pops(solved: Clip, animated: Clip) -> Float64[np.ndarray, "frames legs"]:
+    """How fast the ankles' corrections relative to the pelvis change, m in a `TICK`.
 
     The change is taken over a tick, or over a frame where frames are longer. A steady change gives
     the same number at every frame rate. A jump gives its size at 60 Hz and its multiples, and half
-    of it at 30 Hz, where it cannot be distinguished from a steady change within the frame.
+    of it at 30 Hz, where it cannot be distinguished from a steady change within the frame. It
+    stands at its last frame; NaN before it, and where a cut lies between.
     """
-    frames = max(1, round(fps * TICK))
-    change = np.linalg.norm(correction_ws[frames:] - correction_ws[:-frames], axis=-1)
-    for cut in cuts:
-        change[max(cut - frames, 0) : cut] = np.nan
-    return change * (fps * TICK / frames)
+    before, after = (
+        clip.joints_ws(2) - clip.positions_ws[:, clip.rig.pelvis][:, None]
+        for clip in (animated, solved)
+    )
+    correction = after - before
+    frames = max(1, round(solved.fps * TICK))
+    speed = np.full(correction.shape[:2], np.nan)
+    change = np.linalg.norm(correction[frames:] - correction[:-frames], axis=-1)
+    speed[frames:] = change * (solved.fps * TICK / frames)
+    for cut in solved.cuts:
+        speed[cut : cut + frames] = np.nan
+    return speed
 
 
 def jerk(series: Float[np.ndarray, "*b"], fps: float, cuts: Sequence[int] = ()) -> float:
@@ -349,14 +489,82 @@ def jerk(series: Float[np.ndarray, "*b"], fps: float, cuts: Sequence[int] = ()) 
     return float(np.sqrt(np.mean(third**2))) if third.size else float("nan")
 
 
-def _mean(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if known.size else float("nan")
+def knee_angle(
+    hip: Float[np.ndarray, "*b 3"],
+    knee: Float[np.ndarray, "*b 3"],
+    ankle: Float[np.ndarray, "*b 3"],
+) -> Float[np.ndarray, "*b"]:
+    """Angle between thigh and shin, rad; pi for a straight leg."""
+    thigh, shin = hip - knee, ankle - knee
+    across = np.linalg.norm(np.cross(thigh, shin), axis=-1)
+    return np.arctan2(across, np.sum(thigh * shin, axis=-1))
 
 
-def _largest(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.max()) if known.size else float("nan")
+def straight(
+    hip: Float[np.ndarray, "frames legs 3"],
+    ankle: Float[np.ndarray, "frames legs 3"],
+    lengths: Float[np.ndarray, "legs 2"],
+) -> Bool[np.ndarray, "frames legs"]:
+    """Which legs are straight; lengths are those of thigh and shin, m."""
+    reach = np.linalg.norm(ankle - hip, axis=-1)
+    return reach / np.sum(lengths, axis=-1) >= STRAIGHT_REACH
+
+
+def _mean(values: np.ndarray, among: Bool[np.ndarray, "*b"]) -> float:
+    return float(np.mean(values[among])) if among.any() else math.nan
+
+
+def _extreme(series: Float64[np.ndarray, "frames legs"], names: tuple[str, ...]) -> Extreme:
+    if np.isnan(series).all():
+        return Extreme(math.nan, 0, names[0])
+    frame, leg = np.unravel_index(np.nanargmax(series), series.shape)
+    return Extreme(float(series[frame, leg]), int(frame), names[leg])
+
+
+def bounds(animated: Clip, feet: Soles) -> dict[str, float]:
+    """The bounds of what is made of an animation, by measure, in SI units and fractions of 1.
+
+    They depend on the animation and the ground alone, so that every system has the same.
+
+    Args:
+        animated: the animation, with its root where foot IK gets it.
+        feet: its soles.
+    """
+    size, ground = body.ratio(animated.rig), feet.ground[feet.stance]
+    level = ground.size > 0 and float(np.ptp(ground)) < LEVEL  # false where some are NaN
+    pelvis = animated.positions_ws[:, animated.rig.pelvis, 1]
+    return {name: measure.bound for name, measure in BOUNDED.items()} | {
+        "slide": size * (FLAT_SLIDE if level else VISIBLE),
+        "pop": size * VISIBLE + swing_speed(feet, animated.fps) * TICK,
+        "pelvis_jerk": MEASURES["pelvis_jerk"].bound + jerk(pelvis, animated.fps, animated.cuts),
+    }
+
+
+def swing_speed(feet: Soles, fps: float) -> float:
+    """How fast corrections must change, m/s, for swings between footholds on the ground.
+
+    A standing ball needs a correction of as much as it is in the ground. Between two stances that
+    changes along a path of minimum jerk, whose fastest moment counts; of all swings, the largest.
+    """
+    fastest = 0.0
+    for leg in range(feet.stance.shape[1]):
+        height, runs = feet.height[:, leg, 1], contacts.runs(feet.stance[:, leg])
+        for (_, last), (first, _) in zip(runs, runs[1:], strict=False):
+            change = abs(height[first] - height[last])
+            if not np.isnan(change):
+                fastest = max(fastest, float(SWING_PEAK * change * fps / (first - last)))
+    return fastest
+
+
+CAUSES = {
+    "missing": "the terrain does not lie below the whole path",
+    "units": "the terrain is in another unit of length: one of its units is {0:.4g} m "
+    "(--terrain-scale {0:.4g})",
+    "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
+    "the terrain (--terrain-offset)",
+    "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
+    "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
+}
 
 
 class Cause(NamedTuple):
@@ -365,6 +573,12 @@ class Cause(NamedTuple):
     kind: str
     amount: float = 0.0
     """`offset`: m. `units`: metres for each unit of the terrain."""
+
+    @property
+    def words(self) -> str:
+        """What it is, and what to do."""
+        side = "high" if self.amount > 0 else "low"
+        return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side)
 
 
 Trial = Callable[[Cause], Soles | None]
@@ -421,23 +635,6 @@ def likely_cause(
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a, b)[0, 1]) if np.std(a) > 0 and np.std(b) > 0 else 0.0
-
-
-@dataclass(frozen=True)
-class PlacedMotion:
-    """A motion, and how its feet are placed on the ground."""
-
-    clip: Clip
-    soles_ws: Float64[np.ndarray, "frames legs 2 3"]
-    """m, below ankles and balls."""
-    in_ground: Bool[np.ndarray, "frames legs"]
-    """Where a sole is visibly in the ground, as `placement` counts it."""
-    placement: Placement
-
-
-def place(clip: Clip, feet: Soles, placement: Placement) -> PlacedMotion:
-    """A motion with what was measured of its soles."""
-    return PlacedMotion(clip, sole_points(clip), feet.gap < -placement.visible, placement)
 
 
 def with_soles_of(captured: Clip, flat: Clip) -> Clip:

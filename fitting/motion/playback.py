@@ -26,6 +26,8 @@ from jaxik.world import frame
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import cast
 
+from .measures import knee_angle
+
 RAY_START = 1.0  # m above a joint, where the ray that looks for the ground under it starts
 RAY_LENGTH = 3.0  # m
 
@@ -52,9 +54,7 @@ class Motion(eqx.Module):
     @property
     def knee_angle(self) -> Float[np.ndarray, "frames legs"]:
         """Angle between thigh and shin, rad; pi for a straight leg."""
-        thigh, shin = np.asarray(self.hip - self.knee), np.asarray(self.ankle - self.knee)
-        across = np.linalg.norm(np.cross(thigh, shin), axis=-1)
-        return np.arctan2(across, np.sum(thigh * shin, axis=-1))
+        return knee_angle(*map(np.asarray, (self.hip, self.knee, self.ankle)))
 
 
 class Playback(eqx.Module):

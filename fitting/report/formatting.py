@@ -7,8 +7,9 @@ in it, so that the command line can draw them; to everybody else it is what it s
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
+
+from fitting.motion.measures import Figures, Measure
 
 Table: TypeAlias = list[list[str]]  # rows of cells, the heading first
 
@@ -158,129 +159,24 @@ DIFFERENCES = {  # of `motion.accuracy`
 }
 
 
-@dataclass(frozen=True)
-class Column:
-    """How one figure is shown in a table, and what it means."""
+def figures_table(title: str, motions: Mapping[str, Figures], names: Iterable[str] = ()) -> Table:
+    """Figures of motions, a row for each with its unit; those that none has are left out.
 
-    heading: str
-    unit: str
-    factor: float
-    """Shown value / value in SI units and radians."""
-    digits: int
-    """After the decimal point."""
-    meaning: str
-
-    def format(self, value: float) -> str:
-        """The value in the unit of the column; a dash for NaN."""
-        return "–" if math.isnan(value) else f"{self.factor * value:.{self.digits}f}"
-
-
-ACCURACY = {
-    "pelvis": Column(
-        "pelvis", "cm", 100.0, 2,
-        "Difference in height between the solved and the captured pelvis; rms over frames.",
-    ),
-    "ankle": Column(
-        "ankle", "cm", 100.0, 2,
-        "Distance between solved and captured ankles; rms over frames and legs.",
-    ),
-    "ankle_stance": Column(
-        "ankle in stance", "cm", 100.0, 2, "The same over the frames in which the foot stands."
-    ),
-    "knee": Column(
-        "knee", "cm", 100.0, 2,
-        "Distance between solved and captured knees; rms over frames and legs.",
-    ),
-    "knee_stance": Column(
-        "knee in stance", "cm", 100.0, 2, "The same over the frames in which the foot stands."
-    ),
-    "knee_angle": Column(
-        "knee angle", "°", math.degrees(1.0), 2,
-        "Difference between solved and captured knee angles; rms over frames and legs.",
-    ),
-    "knee_angle_stance": Column(
-        "knee angle in stance", "°", math.degrees(1.0), 2,
-        "The same over the frames in which the foot stands.",
-    ),
-    "straight": Column(
-        "straight", "%", 100.0, 2,
-        "Fraction of frames and legs in which the distance from hip to ankle is at least 99.9 % of "
-        "the length of the leg.",
-    ),
-    "pop": Column(
-        "pop", "cm a frame", 100.0, 2,
-        "Largest change, from one frame to the next, of an ankle's height over the animated "
-        "ankle. It grows with the duration of a frame.",
-    ),
-    "added_slip": Column(
-        "added slip", "mm a frame", 1000.0, 3,
-        "How much further a standing ankle moves horizontally, from one frame to the next, than "
-        "the captured one; mean, where frames in which it moves less count as 0.",
-    ),
-    "bone_length": Column(
-        "bone length", "mm", 1000.0, 3, "Largest error in the length of a thigh or a shin."
-    ),
-}  # fmt: skip
-
-MEASURES = {
-    "penetration_mean": Column(
-        "penetration, mean", "cm", 100.0, 2,
-        "Depth of a foot in the ground, mean over all frames and feet; 0 for a foot above the "
-        "ground. It is the deeper of two points of the sole, one below the ankle and one below "
-        "the ball (the toe joint). Each is as far below its joint, along the foot's up axis, as "
-        "the joint is above the floor while the animated foot stands flat.",
-    ),
-    "penetration_max": Column(
-        "penetration, max", "cm", 100.0, 1, "Largest depth of any foot in the ground."
-    ),
-    "clearance": Column(
-        "sole clearance", "cm", 100.0, 2,
-        "Air under a standing foot, mean over its frames: height above the ground of the lower of "
-        "the same two points, 0 where one of them touches the ground or is in it.",
-    ),
-    "slide": Column(
-        "slide per stance", "cm", 100.0, 2,
-        "Length of the horizontal path of the ball of the foot (the toe joint) during a stance; "
-        "median over the stances of all feet.",
-    ),
-    "pop_max": Column(
-        "largest pop", "cm in 1/60 s", 100.0, 1,
-        "Fastest change of an ankle's correction, that is, of its position after foot IK minus "
-        "its animated position. It is the change over 1/60 s; where frames are longer, the change "
-        "over a frame scaled to 1/60 s, so that clips at different frame rates compare.",
-    ),
-    "pops": Column(
-        "pops", "count", 1.0, 0,
-        "How often an ankle's correction changes by more than 2 cm in 1/60 s. Consecutive frames "
-        "above that speed count as one pop.",
-    ),
-    "knee_jerk": Column(
-        "knee jerk", "rad/s³", 1.0, 0,
-        "Third derivative of the knee angle, by differences of four consecutive frames; root mean "
-        "square over all knees. It grows with the frame rate of a clip: compare it with that of "
-        "the animation.",
-    ),
-    "pelvis_jerk": Column(
-        "pelvis jerk", "m/s³", 1.0, 1,
-        "The same for the height of the pelvis.",
-    ),
-    "reached": Column(
-        "targets reached", "%", 100.0, 1,
-        "Fraction of the ankle targets, over all frames and feet with ground under them, that "
-        "ankles miss by less than 5 mm (of an adult).",
-    ),
-    "straight": Column(
-        "straight knees", "%", 100.0, 1,
-        "Fraction of all frames and legs in which the knee angle is above 175°.",
-    ),
-}  # fmt: skip
+    Args:
+        title: of the first column.
+        motions: one or more, by name; a column for each.
+        names: which figures; all, if there is none.
+    """
+    measures = next(iter(motions.values())).measures()
+    known = [
+        name
+        for name in names or measures
+        if not all(math.isnan(getattr(figures, name)) for figures in motions.values())
+    ]
+    rows = [[measures[n].title, *(figures.text(n) for figures in motions.values())] for n in known]
+    return [[title, *motions], *rows]
 
 
-def headings(columns: Mapping[str, Column]) -> list[str]:
-    """Headings of a table, each with its unit."""
-    return [f"{column.heading}, {column.unit}" for column in columns.values()]
-
-
-def meanings(columns: Mapping[str, Column]) -> list[list[str]]:
-    """What each column means: its heading with its unit, and a text."""
-    return [[f"{column.heading} ({column.unit})", column.meaning] for column in columns.values()]
+def meanings(measures: Mapping[str, Measure]) -> list[list[str]]:
+    """What each measure means: its heading with its unit, and a text."""
+    return [[f"{each.heading} ({each.unit})", each.meaning] for each in measures.values()]

@@ -174,8 +174,8 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
 
 def _points(motion: PlacedMotion) -> np.ndarray:
     """Joints and, after them, both points of each sole, m: (frames, points, 3)."""
-    frames = len(motion.soles_ws)
-    return np.concatenate([motion.clip.positions_ws, motion.soles_ws.reshape(frames, -1, 3)], 1)
+    soles_ws = motion.soles.points_ws
+    return np.concatenate([motion.clip.positions_ws, soles_ws.reshape(len(soles_ws), -1, 3)], 1)
 
 
 def _pack_ground(ground: GroundPatch, corner: np.ndarray) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def _pack_ground(ground: GroundPatch, corner: np.ndarray) -> dict[str, Any]:
 def _lowest(ground: GroundPatch, motion: PlacedMotion) -> float:
     """Height of the lowest known ground, m, or else of the lowest sole of a motion."""
     known = np.isfinite(ground.heights)
-    return float(np.nanmin(ground.heights if known.any() else motion.soles_ws))
+    return float(np.nanmin(ground.heights if known.any() else motion.soles.points_ws))
 
 
 def _travel(pelvis: np.ndarray) -> list[float]:

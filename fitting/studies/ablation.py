@@ -34,7 +34,7 @@ from fitting.experiment.problems import ClipData, load_clip_data, problem_from_c
 from fitting.experiment.systems import leaf_names
 from fitting.ground.ground_path import place_root
 from fitting.inference.sample.blocks import SamplerSettings
-from fitting.motion.accuracy import Accuracy, Errors, clip_errors, summarise
+from fitting.motion.accuracy import ACCURACY, Accuracy, Errors, clip_errors, summarise
 from fitting.report import pages
 from fitting.report.document import (
     Block,
@@ -48,15 +48,8 @@ from fitting.report.document import (
     Terms,
     Text,
 )
-from fitting.report.formatting import (
-    ACCURACY,
-    Table,
-    headings,
-    meanings,
-    number,
-    transposed,
-)
-from fitting.report.style import AFTER, CAPTURED, STAGES, legend, panels, styled
+from fitting.report.formatting import Table, meanings, number, transposed
+from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
@@ -73,7 +66,7 @@ from .output import output_folder, publish
 NUMBERS = "contribution.json"
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
-SHOWN = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "pop")
+SHOWN = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "lift_change")
 
 MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
 
@@ -351,7 +344,7 @@ def _rows(stored: Rows) -> list[Row]:
 def _row(stored: StoredRow) -> Row:
     figures = {key: math.nan if v is None else v for key, v in stored["agreement"].items()}
     fields = checked({**stored, "agreement": figures}, Row)
-    return Row(**{**fields, "agreement": Accuracy(**figures)})
+    return Row(**{**fields, "agreement": Accuracy(**fields["agreement"])})
 
 
 def _write(folder: Path | None, rows: Sequence[Row]) -> None:
@@ -363,10 +356,7 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
 
 def row_text(row: Row) -> str:
     """A finished row in one line, for the terminal."""
-    figures = ", ".join(
-        f"{ACCURACY[key].heading} {ACCURACY[key].format(getattr(row.agreement, key))}"
-        for key in SHOWN
-    )
+    figures = ", ".join(f"{ACCURACY[key].heading} {row.agreement.text(key)}" for key in SHOWN)
     return f"{row_name(row)}: {figures}; {row.seconds:.0f} s"
 
 
@@ -384,7 +374,7 @@ def group(rows: Sequence[Row], part: int) -> Table:
     """A row for each variant; in brackets, how much each figure rises without the rule."""
     members = [row for row in rows if row.part == part]
     complete = members[0].agreement
-    table = [["", *headings(ACCURACY)]]
+    table = [["", *(column.title for column in ACCURACY.values())]]
     for row in members:
         figures = []
         for key, column in ACCURACY.items():
@@ -637,7 +627,7 @@ def _bars(axes: Axes, key: str, rows: Sequence[Row], variants: Sequence[str]) ->
     axes.set_yticks(range(len(variants)), [variant_name(variant) for variant in variants])
     axes.tick_params(axis="y", length=0)
     axes.grid(False, axis="y")
-    axes.set_title(f"{column.heading.capitalize()}, {column.unit}")
+    axes.set_title(column.title.capitalize())
 
 
 @in_float64

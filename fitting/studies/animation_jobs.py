@@ -12,14 +12,14 @@ from fitting.clips import Clip, flight, save_clip
 from fitting.clips.formats.saving import check_clip_file
 from fitting.ground.meshes import mesh_of
 from fitting.motion import accuracy
-from fitting.report.formatting import aligned, joined
+from fitting.report.formatting import aligned, figures_table, joined
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64, with_floats
 
 from . import animations, comparison, comparison_report, suite, suite_report
 from .animations import AnimationFiles, load_animation
 from .comparison import Comparison
-from .fit import fit_tables, run_folder
+from .fit import run_folder
 from .output import output_folder, publish
 from .suite import Plan, Suite, SystemsOf
 
@@ -55,8 +55,8 @@ def compare(
         differences = animations.measure(systems, loaded, rates)
         compared = dataclasses.replace(compared, rates=differences)
         publish(folder, comparison_report.document(compared))
-        for name, (placement, cause) in compared.placements.items():
-            animations.warn(placement, cause, name)
+        for name, cause in compared.causes.items():
+            animations.warn(compared.motions[name].measures, loaded.bounds, cause, name)
         return compared
 
 
@@ -114,8 +114,8 @@ def solve(
 ) -> Clip:
     """Solves a flat animation, and measures how its feet are placed on the ground.
 
-    Where a captured motion is known, the log also shows the difference. Feet that are visibly off
-    the ground, slide or pop are a warning, with the most likely cause.
+    Where a captured motion is known, the log also shows the difference. What is beyond its bound is
+    a warning, with the most likely cause of feet off the ground.
 
     Args:
         ik: the system.
@@ -141,21 +141,26 @@ def solve(
         result, solved = loaded.solve(ik)
     seconds = time.perf_counter() - began
     with activity.announced("Measuring how the feet are placed"):
-        placement, cause = loaded.assess(solved)
+        motion = loaded.place(solved, result)
+        cause = loaded.cause(motion)
     if path is not None:
-        joints = animations.arrays(solved, placement)
+        joints = animations.arrays(motion)
         ground = mesh_of(loaded.terrain) if with_terrain else None
         save_clip(path, solved, joints=joints, ground=ground)
-    activity.log(animations.solved_text(loaded.reached(result), seconds, path))
+    written = "" if path is None else f"; written to {path}"
+    activity.log(f"{solved.frame_count} frames in {seconds:.1f} s{written}")
     where = [
         f"root: {loaded.root.reason}",
         flight.describe(loaded.clip),
         animations.trunk_text(result, solved),
         *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
-    activity.log(joined([*filter(None, where), "", animations.text(placement)]))
+    table = figures_table("feet on the ground", {"solved": motion.measures})
+    activity.log(joined([*filter(None, where), "", aligned(table)]))
     if loaded.captured is not None:
         errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
-        activity.log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
-    animations.warn(placement, cause)
+        accuracies = {"solved": accuracy.summarise([errors])}
+        table = figures_table("difference from the captured motion", accuracies)
+        activity.log(joined(["", aligned(table)]))
+    animations.warn(motion.measures, loaded.bounds, cause)
     return solved

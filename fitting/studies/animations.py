@@ -13,10 +13,9 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,17 +41,15 @@ from fitting.motion.flat_animation import (
     with_remark_if_uneven,
 )
 from fitting.motion.measures import (
-    MISSING_LIMIT,
-    POP_LIMIT,
-    SLIDE_LIMIT,
+    NOISY,
     Cause,
-    Extreme,
-    Placement,
+    Measures,
+    PlacedMotion,
     Soles,
     likely_cause,
+    place,
 )
 from fitting.motion.playback import stage_outputs
-from fitting.report.formatting import Table, aligned, percent
 from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
@@ -119,6 +116,8 @@ class Animation:
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
     root: RootChoice = AS_ANIMATED
+    is_made: bool = False
+    """Whether it has no noise, unlike a capture."""
     carried: Float64[np.ndarray, "frames 3"] | None = None
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
     speed: float = 1.0
@@ -186,15 +185,32 @@ class Animation:
         grounded = np.asarray(trace.sensed.foothold.found) > 0
         return np.where(grounded, near.astype(np.float64), np.nan)
 
-    def assess(self, solved: Clip) -> tuple[Placement, Cause | None]:
-        """How the feet of a solved clip are placed; why, if they are off the ground."""
-        _, placed = self.place(solved)
-        if not placed.misplaced:
-            return placed, None
+    @cached_property
+    def bounds(self) -> dict[str, float]:
+        """The bounds of what is made of it, by measure; see `measures.bounds`."""
+        animated = self.placed_clip
+        bounds = measures.bounds(animated, self._soles(animated))
+        return bounds if self.is_made else {k: v for k, v in bounds.items() if k not in NOISY}
+
+    def place(self, solved: Clip, result: jaxik.Result | None = None) -> PlacedMotion:
+        """A motion on the ground, and what is measured of it.
+
+        Args:
+            solved: the motion.
+            result: of the system that made it; None leaves unknown which targets are reached.
+        """
+        reached = None if result is None else self.reached(result)
+        own = self._own_speed
+        return place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
+
+    def cause(self, motion: PlacedMotion) -> Cause | None:
+        """Why the feet of a motion are off their ground; None where they are not."""
+        if not motion.measures.misplaced:
+            return None
         animated, files = self.placed_clip, self.files
         unit = 1.0 if files is None else files.terrain_options.scale or 1.0
         soles = self._soles(animated)
-        return placed, likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+        return likely_cause(soles, animated, unit=unit, trial=self._soles_without)
 
     def _soles_without(self, cause: Cause) -> Soles | None:
         """The soles of the animation after the remedy for a cause; None where that is no remedy."""
@@ -208,11 +224,6 @@ class Animation:
         except ValueError:  # no ground below the path, or a terrain beyond all bounds
             pass
         return None
-
-    def place(self, solved: Clip) -> tuple[Soles, Placement]:
-        """The soles of a solved clip over the ground, and how its feet are placed."""
-        soles = self._soles(solved)
-        return soles, measures.assess(soles, solved, self.placed_clip, own_speed=self._own_speed)
 
     @property
     def _own_speed(self) -> Clip:
@@ -372,56 +383,7 @@ def _difference(system: str, solved: Clip, reference: Clip, step: int) -> RateDi
 
 
 class PlacementWarning(UserWarning):
-    """Feet are visibly off their ground, slide or pop."""
-
-
-CAUSES = {
-    "missing": "the terrain does not lie below the whole path",
-    "units": "the terrain is in another unit of length: one of its units is {0:.4g} m "
-    "(--terrain-scale {0:.4g})",
-    "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
-    "the terrain (--terrain-offset)",
-    "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
-    "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
-}
-
-
-def table(placement: Placement) -> Table:
-    """What a viewer sees, a row for each kind: how often or how far, and the largest with place."""
-    return [
-        [f"feet and ground, {_seen(placement)} or more", "frames", "largest"],
-        ["standing feet in the ground", _share(placement.sunk), _place(placement.deepest)],
-        ["standing feet above the ground", _share(placement.floating), _place(placement.highest)],
-        ["moving feet in the ground", _share(placement.sunk_swing), ""],
-        ["any foot in the ground", _share(placement.sunk_frames), ""],
-        ["no ground under the sole", _share(placement.groundless), ""],
-        ["slide in a stance, median", _cm(placement.slide), _place(placement.largest_slide)],
-        ["pop in 1/60 s", "", _place(placement.pop)],
-    ]
-
-
-def text(placement: Placement) -> str:
-    """The table for a terminal. Slides and pops are those beyond the animation's own."""
-    return aligned(table(placement))
-
-
-def solved_text(
-    reached: Float64[np.ndarray, "frames legs"], seconds: float, path: Path | None
-) -> str:
-    """How long a clip took, how much ground it found and reached, and where it is written.
-
-    Args:
-        reached: as `Animation.reached` gives it.
-        seconds: which it took.
-        path: of the solved clip; None if it was not written.
-    """
-    found = ~np.isnan(reached)
-    share = f"{np.mean(reached[found]):.1%}" if found.any() else "none"
-    return (
-        f"{len(reached)} frames in {seconds:.1f} s: ground under {np.mean(found):.1%} of "
-        f"the feet, {share} of the targets reached"
-        + ("" if path is None else f"; written to {path}")
-    )
+    """What a viewer sees of a motion on its ground is beyond a bound."""
 
 
 def trunk_text(result: jaxik.Result, clip: Clip) -> str:
@@ -440,79 +402,34 @@ def trunk_text(result: jaxik.Result, clip: Clip) -> str:
     return f"{text}; {clip.joint_names[trunk.head]} turns back"
 
 
-def arrays(solved: Clip, placement: Placement) -> dict[str, np.ndarray]:
+def arrays(motion: PlacedMotion) -> dict[str, np.ndarray]:
     """What is written beside a solved clip: positions by role, and `placement` as JSON."""
-    described = np.array(json.dumps(numbers(placement)))
-    return positions_by_role(solved) | {"placement": described}
+    described = np.array(json.dumps(motion.measures.numbers()))
+    return positions_by_role(motion.clip) | {"placement": described}
 
 
-def numbers(placement: Placement) -> dict[str, Any]:
-    """The placement as JSON holds it: m and fractions of 1, null for NaN."""
-    return _without_nan(asdict(placement))
-
-
-def warn(placement: Placement, cause: Cause | None, name: str = "") -> None:
-    """Warns of all that is beyond its limit; see `warning_texts`. The name precedes each text."""
-    for text in warning_texts(placement, cause):
+def warn(
+    measured: Measures, bounds: Mapping[str, float], cause: Cause | None, name: str = ""
+) -> None:
+    """Warns of all that is beyond its bound; see `warning_texts`. The name precedes each text."""
+    for text in warning_texts(measured, bounds, cause):
         text = f"{name}: {text}" if name else text
         warnings.warn(text, PlacementWarning, stacklevel=3)
 
 
-def warning_texts(placement: Placement, cause: Cause | None) -> list[str]:
-    """What is beyond its limit, a sentence for each.
+def warning_texts(
+    measured: Measures, bounds: Mapping[str, float], cause: Cause | None
+) -> list[str]:
+    """What is beyond its bound, a sentence for each, the worst first.
 
     Args:
-        placement: of a motion.
+        measured: of a motion.
+        bounds: by measure.
         cause: of feet off their ground; None where they are not.
     """
-    texts = []
+    texts = [bounded.words for bounded in measured.against(bounds) if bounded.is_beyond]
     if cause is not None:
-        amount = cause.amount
-        reason = CAUSES[cause.kind].format(
-            amount, abs(100 * amount), "high" if amount > 0 else "low"
-        )
-        texts.append(f"{_off_ground(placement)}; likely cause: {reason}")
-    elif math.isnan(placement.sunk):
+        texts.append(f"likely cause of feet off the ground: {cause.words}")
+    elif math.isnan(measured.contact):
         texts.append("no foot of the animation ever stands; see its contacts with `jaxik inspect`")
-    if placement.slide > SLIDE_LIMIT * placement.size:
-        texts.append(
-            f"standing feet slide by {_cm(placement.slide)} a stance more than animated (most: "
-            f"{_place(placement.largest_slide)})"
-        )
-    if placement.pop.value > POP_LIMIT * placement.size:
-        texts.append(f"feet pop in 1/60 s (most: {_place(placement.pop)})")
     return texts
-
-
-def _off_ground(placement: Placement) -> str:
-    if placement.groundless > MISSING_LIMIT:
-        return f"there is no ground under {_share(placement.groundless)} of the soles"
-    return (
-        f"standing feet are {_seen(placement)} or more in the ground in {_share(placement.sunk)} "
-        f"of their frames (deepest: {_place(placement.deepest)}) and above it in "
-        f"{_share(placement.floating)} (highest: {_place(placement.highest)})"
-    )
-
-
-def _seen(placement: Placement) -> str:
-    return f"{100 * placement.visible:.2g} cm"
-
-
-def _share(fraction: float) -> str:
-    return "–" if math.isnan(fraction) else percent(fraction)
-
-
-def _cm(length: float) -> str:
-    return "–" if math.isnan(length) else f"{100 * length:z.1f} cm"
-
-
-def _place(extreme: Extreme) -> str:
-    if math.isnan(extreme.value):
-        return "–"
-    return f"{_cm(extreme.value)}, {extreme.leg}, frame {extreme.frame}"
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(entry) for key, entry in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value

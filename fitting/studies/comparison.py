@@ -1,45 +1,34 @@
 """Several systems on one flat animation, measured side by side."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64
 
 import jaxik
-from fitting.clips import Clip
-from fitting.clips.clip_frames import positions_by_role
 from fitting.experiment.parameter_files import load_system
 from fitting.experiment.systems import preset_system
-from fitting.ground import ground_patch
-from fitting.ground.ground_patch import GroundPatch
-from fitting.motion import accuracy, measures
+from fitting.motion import accuracy
 from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import (
+    MEASURES,
+    Bounded,
     Cause,
-    FootStates,
-    Measures,
     PlacedMotion,
-    Placement,
     Soles,
-    place,
     with_soles_of,
 )
-from fitting.motion.playback import RAY_START, Motion
-from fitting.motion.worst_window import SECONDS
+from fitting.motion.worst_window import SECONDS, window_sums
 from fitting.runtime import activity
 from fitting.runtime.display import Shown, data_frame
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from jaxik.maths import vec
-from jaxik.world.terrain import Terrain, cast
 
 from .animations import Animation, RateDifference
 from .fit.run_folder import PARAMETERS
-from .suite import Scene
 
 if TYPE_CHECKING:
     import pandas
@@ -53,21 +42,53 @@ class Comparison(Shown):
     """One clip under several systems, by name; the animation itself comes first."""
 
     title: str
-    legs: tuple[str, ...]
-    fps: float
-    ground: Float64[np.ndarray, "frames legs"]
-    """m, height under the animated ankles, or NaN."""
-    groundless: float
-    """Fraction of all points of soles that have no ground under them."""
     animation: Animation
-    clips: Mapping[str, Clip]
-    """As the systems leave it."""
-    motions: Mapping[str, Motion]
-    measures: Mapping[str, Measures]
-    placements: Mapping[str, tuple[Placement, Cause | None]]
-    """Of the systems, without the animation; see `Animation.assess`."""
+    motions: Mapping[str, PlacedMotion]
+    """The animation as foot IK gets it, and what systems make of it."""
+    causes: Mapping[str, Cause | None]
+    """Why feet are off their ground, of the systems; None where they are not."""
+    failures: Mapping[str, str] = field(default_factory=dict)
+    """What went wrong, of systems that gave no motion."""
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
+
+    @property
+    def animated(self) -> PlacedMotion:
+        """The animation as foot IK gets it."""
+        return self.motions[ANIMATED]
+
+    @property
+    def systems(self) -> tuple[str, ...]:
+        """Names of the systems that gave a motion."""
+        return tuple(self.causes)
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """The bounds of all systems, by measure."""
+        return self.animation.bounds
+
+    @cached_property
+    def captured(self) -> PlacedMotion | None:
+        """The captured motion, where it is known."""
+        captured = self.animation.captured
+        if captured is None:
+            return None
+        return self.animation.place(with_soles_of(captured, self.animation.clip))
+
+    @cached_property
+    def accuracy(self) -> dict[str, Accuracy]:
+        """How far each is from the captured motion; of none where that is unknown."""
+        captured, flat = self.animation.captured, self.animated.clip
+        if captured is None:
+            return {}
+        return {
+            name: accuracy.summarise([accuracy.clip_errors(motion.clip, captured, flat)])
+            for name, motion in self.motions.items()
+        }
+
+    def against(self, system: str) -> list[Bounded]:
+        """What is measured of a system beside its bounds, the worst first."""
+        return self.motions[system].measures.against(self.bounds)
 
     def table(self) -> "pandas.DataFrame":
         """The measures in SI units, a row for each system, as pandas has tables.
@@ -75,7 +96,10 @@ class Comparison(Shown):
         Raises:
             ImportError: pandas is not installed.
         """
-        rows = ({"system": name} | vars(measures) for name, measures in self.measures.items())
+        rows = (
+            {"system": name} | {key: getattr(motion.measures, key) for key in MEASURES}
+            for name, motion in self.motions.items()
+        )
         return data_frame(rows, "system")
 
 
@@ -146,6 +170,7 @@ def compare(
     animation: Animation,
     *,
     title: str = "",
+    keep_going: bool = False,
 ) -> Comparison:
     """Runs all systems on an animation and measures the motions.
 
@@ -155,103 +180,30 @@ def compare(
         systems: by name.
         animation: the flat animation and the terrain, y up.
         title: of tables and figures.
+        keep_going: whether a system that gives no motion is noted, and the others go on.
 
     Raises:
         ValueError: parameters do not fit the legs, or give poses that are not finite.
     """
-    clip = animation.placed_clip
+    if not keep_going:
+        for name, ik in systems.items():
+            with error_context(name):
+                animation.check_shapes(ik)
+    solved, failures = {}, {}
     for name, ik in systems.items():
-        with error_context(name):
-            animation.check_shapes(ik)
-    clips = {ANIMATED: clip}
-    reached = {ANIMATED: np.full((clip.frame_count, len(clip.rig.joints)), np.nan)}
-    for name, ik in systems.items():
-        with error_context(name), activity.announced(f"Compiling and running {name}"):
-            result, clips[name] = animation.solve(ik)
-        reached[name] = animation.reached(result)
-
+        try:
+            with activity.announced(f"Compiling and running {name}"):
+                animation.check_shapes(ik)
+                solved[name] = animation.solve(ik)
+        except ValueError as error:
+            if not keep_going:
+                raise ValueError(f"{name}: {error}") from error
+            failures[name] = str(error)
     with activity.announced("Measuring the motions"):
-        soles_ws = np.stack([measures.sole_points(solved) for solved in clips.values()])
-        ground = ground_heights(animation.terrain, soles_ws)
-        motions = {name: motion_of(solved) for name, solved in clips.items()}
-        measured = {}
-        for index, name in enumerate(clips):
-            gaps = measures.gaps(soles_ws[index], ground[index])
-            gaps[~clip.observed] = np.nan
-            feet = FootStates(gaps, clip.observed_stances(), reached[name])
-            measured[name] = measures.measure(
-                motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
-            )
-        return Comparison(
-            title=title,
-            legs=clip.rig.names,
-            fps=clip.fps,
-            ground=ground[0, :, :, 0],
-            groundless=float(np.mean(np.isnan(ground))),
-            animation=animation,
-            clips=clips,
-            motions=motions,
-            measures=measured,
-            placements={name: animation.assess(clips[name]) for name in systems},
-        )
-
-
-def ground_heights(
-    terrain: Terrain, points_ws: Float64[np.ndarray, "systems ... 3"]
-) -> Float64[np.ndarray, "systems ..."]:
-    """Height of the ground under points of several systems, m; NaN where there is none.
-
-    The rays for a point start above the highest place where any system puts it, so that an
-    animation deep inside a hill finds the top of the hill, as a system does that climbs it.
-    """
-    highest = points_ws[..., 1].max(axis=0)
-    origins = points_ws.copy()
-    origins[..., 1] = highest + RAY_START
-    hit = cast(terrain, jnp.asarray(origins), jnp.inf)
-    height = np.asarray(vec.dot(hit.point, terrain.up_ws), np.float64)
-    return np.where(np.asarray(hit.found) > 0, height, np.nan)
-
-
-def motion_of(clip: Clip) -> Motion:
-    """Joints of a clip by their role."""
-    joints = positions_by_role(clip)
-    return Motion(**{"toe" if role == "ball" else role: at for role, at in joints.items()})
-
-
-@dataclass(frozen=True)
-class ComparedMotions:
-    """What several systems make of one animation."""
-
-    motions: Mapping[str, PlacedMotion]
-    """By name; the animation itself comes first, with its root where foot IK gets it."""
-    worst: Mapping[str, tuple[int, int]]
-    """First and last frame of the `SECONDS` in which the feet of each are furthest off."""
-    captured: PlacedMotion | None
-    """Where it is known."""
-    accuracy: Mapping[str, Accuracy]
-    """How far each is from the captured motion; of none where that is unknown."""
-    stance: Bool[np.ndarray, "frames legs"]
-    """Where the animation says that a foot stands."""
-    ground: GroundPatch
-
-
-@in_float64
-def of_comparison(comparison: Comparison) -> ComparedMotions:
-    """The motions of a comparison."""
-    animation = comparison.animation
-    measured = {name: animation.place(clip) for name, clip in comparison.clips.items()}
-    return _compared(animation, comparison.clips, measured)
-
-
-@in_float64
-def of_scene(scene: Scene) -> ComparedMotions:
-    """The motions of a situation of the suite, without systems that gave none."""
-    animation = scene.animation
-    clips = {name: outcome.clip for name, outcome in scene.outcomes.items()}
-    measured = {name: (own.soles, own.placement) for name, own in scene.outcomes.items()}
-    flat = animation.placed_clip
-    first = {ANIMATED: flat}, {ANIMATED: animation.place(flat)}
-    return _compared(animation, first[0] | clips, first[1] | measured)
+        motions = {ANIMATED: animation.place(animation.placed_clip)}
+        motions |= {name: animation.place(clip, result) for name, (result, clip) in solved.items()}
+        causes = {name: animation.cause(motions[name]) for name in solved}
+    return Comparison(title, animation, motions, causes, failures)
 
 
 def worst_seconds(feet: Soles, fps: float) -> tuple[int, int]:
@@ -267,31 +219,5 @@ def worst_seconds(feet: Soles, fps: float) -> tuple[int, int]:
     gap = np.nan_to_num(feet.gap)
     off = np.sum(np.maximum(-gap, 0.0) + np.where(feet.stance, np.maximum(gap, 0.0), 0.0), axis=1)
     frames = min(len(off), round(SECONDS * fps) + 1)
-    sums = np.convolve(off, np.ones(frames), mode="valid")
-    start = int(np.argmax(sums))
+    start = int(np.argmax(window_sums(off, frames)))
     return start, start + frames - 1
-
-
-def _compared(
-    animation: Animation,
-    clips: Mapping[str, Clip],
-    measured: Mapping[str, tuple[Soles, Placement]],
-) -> ComparedMotions:
-    flat, captured = animation.placed_clip, animation.captured
-    if captured is not None:
-        captured = with_soles_of(captured, animation.clip)
-    # Rays start above the highest motion, so that one inside a hill does not hide the hill.
-    highest = max(clips.values(), key=lambda clip: float(clip.positions_ws[..., 1].max()))
-    return ComparedMotions(
-        motions={name: place(clip, *measured[name]) for name, clip in clips.items()},
-        worst={name: worst_seconds(feet, flat.fps) for name, (feet, _) in measured.items()},
-        captured=None if captured is None else place(captured, *animation.place(captured)),
-        accuracy={
-            name: accuracy.summarise([accuracy.clip_errors(clip, captured, flat)])
-            for name, clip in clips.items()
-        }
-        if captured is not None
-        else {},
-        stance=flat.stance_labels(),
-        ground=ground_patch.around_path(highest, animation.terrain),
-    )

@@ -1,9 +1,9 @@
 """The report of a comparison: a table with its explanation, the numbers, and a figure."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,14 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.clips import flight
-from fitting.motion.measures import (
-    MISSING_LIMIT,
-    POP_LIMIT,
-    SHARE_LIMIT,
-    SLIDE_LIMIT,
-    Measures,
-    Placement,
-)
+from fitting.ground import ground_patch
+from fitting.motion.measures import BOUNDED, MEASURES, Bounded, Measures
 from fitting.report import motion_data
 from fitting.report.document import (
     Block,
@@ -34,7 +28,7 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import MEASURES, Table, headings, meanings, percent, transposed
+from fitting.report.formatting import Table, figures_table, meanings, percent, transposed
 from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
 from fitting.report.style import (
     BEFORE,
@@ -50,8 +44,7 @@ from fitting.report.style import (
 from fitting.runtime.precision import in_float64
 
 from .animations import JOINTS
-from .comparison import ANIMATED, ComparedMotions, Comparison, of_comparison
-from .fit import fit_figures
+from .comparison import ANIMATED, Comparison, worst_seconds
 from .fit.sentences import listed
 
 TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
@@ -70,20 +63,40 @@ BAR_PANELS = 5  # in a row
 
 RADIUS = 0.018  # m, of the bones of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has
+UNKNOWN = Bounded("", 0.0, "nothing is known of its feet")
+MARKED = "What is marked (!) is beyond its bound."
+BOUND, MISS = "bound", "!"  # a row of tables, and the mark of what is beyond it
 
 
-def table(comparison: Comparison) -> Table:
-    """The measures, a row for each system."""
-    rows = [
-        [name, *(MEASURES[key].format(value) for key, value in asdict(measures).items())]
-        for name, measures in comparison.measures.items()
+def rows(comparison: Comparison, names: Sequence[str]) -> Table:
+    """The bounds, and these measures of all systems, with marks; a row each, its name first."""
+    bounds = comparison.bounds
+    limits = [MEASURES[name].limit(bounds[name]) if name in bounds else "" for name in names]
+    made = [[system, *_cells(comparison, system, names)] for system in comparison.motions]
+    failed = [[system, *[f"none{MISS}" for _ in names]] for system in comparison.failures]
+    return [[BOUND, *limits], *made, *failed]
+
+
+def _cells(comparison: Comparison, system: str, names: Sequence[str]) -> list[str]:
+    measured = comparison.motions[system].measures
+    beyond = {b.name for b in measured.against(comparison.bounds) if b.is_beyond}
+    return [
+        MEASURES[name].format(getattr(measured, name)) + (MISS if name in beyond else "")
+        for name in names
     ]
-    return [["system", *headings(MEASURES)], *rows]
+
+
+def reasons(names: Iterable[str] = BOUNDED) -> list[str]:
+    """The bounds of measures with their reasons, a sentence each."""
+    return [
+        f"{measure.heading} {measure.limit(measure.bound)} {measure.unit}: {measure.reason}"
+        for measure in map(MEASURES.__getitem__, names)
+    ]
 
 
 def rate_table(comparison: Comparison) -> Table:
     """How far each system is from its motion at the clip's rate, rms and largest, in mm."""
-    heading = [f"mm from {comparison.fps:g} Hz", "at", *JOINTS, "largest"]
+    heading = [f"mm from {comparison.animation.clip.fps:g} Hz", "at", *JOINTS, "largest"]
     return [heading] + [
         [row.system, f"{row.fps:g} Hz"]
         + [f"{1000 * row.rms[joint]:.1f}" for joint in JOINTS]
@@ -92,18 +105,22 @@ def rate_table(comparison: Comparison) -> Table:
     ]
 
 
-def _numbers(comparison: Comparison) -> dict[str, Any]:
+def numbers(comparison: Comparison) -> dict[str, Any]:
     """The content of compare.json: SI units, radians and fractions of 1; null for NaN."""
+    animation = comparison.animation
     return {
         "title": comparison.title,
-        "frames": len(comparison.ground),
-        "fps": comparison.fps,
-        "soles_without_ground": comparison.groundless,
+        "frames": animation.clip.frame_count,
+        "fps": animation.clip.fps,
+        "root": animation.root.reason,
+        "bounds": comparison.bounds,
         "systems": [
-            {"name": name}
-            | {key: None if np.isnan(value) else value for key, value in asdict(measures).items()}
-            for name, measures in comparison.measures.items()
+            {"name": name, **motion.measures.numbers()}
+            | {"beyond": [b.name for b in comparison.against(name) if b.is_beyond]}
+            | {"cause": cause.kind if (cause := comparison.causes.get(name)) else None}
+            for name, motion in comparison.motions.items()
         ],
+        "failures": dict(comparison.failures),
         "rates": [asdict(row) for row in comparison.rates],
     }
 
@@ -120,15 +137,17 @@ class LineStyle(TypedDict):
 def overview(comparison: Comparison) -> Figure:
     """Heights of ankles and pelvis under every system, with the ground, and bars of measures."""
     styles = _line_styles(comparison.motions)
+    legs = comparison.animation.clip.rig.names
     bar_rows = -(-len(MEASURES) // BAR_PANELS)
-    heights = 3.4 * (len(comparison.legs) + 1) + 0.6, bar_rows * (0.42 * len(styles) + 1.0)
+    heights = 3.4 * (len(legs) + 1) + 0.6, bar_rows * (0.42 * len(styles) + 1.0)
     figure = Figure(figsize=(17, sum(heights) + 1.6), layout="constrained")
     figure.suptitle(comparison.title)
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     _draw_heights(upper, comparison, styles)
     grid = lower.subplots(bar_rows, BAR_PANELS, squeeze=False, sharey=True)
+    measured = {name: motion.measures for name, motion in comparison.motions.items()}
     for axes, key in zip(grid.flat, MEASURES, strict=False):
-        _bars(axes, key, comparison.measures, styles)
+        _bars(axes, key, measured, styles)
     lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
     legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
     return figure
@@ -138,18 +157,20 @@ def _draw_heights(
     figure: FigureBase, comparison: Comparison, styles: Mapping[str, LineStyle]
 ) -> None:
     """Heights over time, a panel for each leg and one for the pelvis."""
-    ground, motions = comparison.ground, comparison.motions
-    time = np.arange(len(ground)) / comparison.fps
-    pelvis = np.mean([motion.pelvis[:, 1] for motion in motions.values()], axis=0)
-    columns = whole_and_part(figure, time, pelvis, len(comparison.legs) + 1)
+    ground, clip = comparison.animated.soles.ground[..., 0], comparison.animated.clip
+    time = np.arange(clip.frame_count) / clip.fps
+    clips = {name: motion.clip for name, motion in comparison.motions.items()}
+    pelvises = {name: own.positions_ws[:, own.rig.pelvis, 1] for name, own in clips.items()}
+    pelvis = np.mean(list(pelvises.values()), axis=0)
+    columns = whole_and_part(figure, time, pelvis, len(clip.rig.names) + 1)
     for panels in columns:
-        for leg, (axes, name) in enumerate(zip(panels, comparison.legs, strict=False)):
-            for system, motion in motions.items():
-                axes.plot(time, 100 * motion.ankle[:, leg, 1], **styles[system])
+        for leg, (axes, name) in enumerate(zip(panels, clip.rig.names, strict=False)):
+            for system, own in clips.items():
+                axes.plot(time, 100 * own.joints_ws(2)[:, leg, 1], **styles[system])
             earth(axes, time, 100 * ground[:, leg])
             axes.set_title(f"{_title(name)} ankle, with the ground under the animated one")
-        for system, motion in motions.items():
-            panels[-1].plot(time, 100 * motion.pelvis[:, 1], **styles[system])
+        for system, heights in pelvises.items():
+            panels[-1].plot(time, 100 * heights, **styles[system])
         earth(panels[-1], time, 100 * ground.mean(axis=1))
         panels[-1].set_title("Pelvis, with the mean ground under the animated feet")
     for axes in columns[0]:
@@ -202,105 +223,98 @@ def _bars(
     axes.set_yticks(rows, list(measures))
     axes.tick_params(axis="y", length=0)
     axes.grid(False)
-    axes.set_title(f"{MEASURES[key].heading.capitalize()}, {MEASURES[key].unit}")
+    axes.set_title(MEASURES[key].title.capitalize())
 
 
 @in_float64
 def document(comparison: Comparison) -> Document:
     """What a comparison says."""
-    compared = of_comparison(comparison)
-    systems = tuple(comparison.placements)
-    placements = {name: compared.motions[name].placement for name in systems}
-    failing = beyond(placements)
-    worst = max(systems, key=lambda name: faults(placements[name])[0].excess)
-    visible = compared.motions[ANIMATED].placement.visible
+    systems = comparison.systems
+    failing = beyond(comparison)
+    measures = list(MEASURES)
+    titles = ["", *(measure.title for measure in MEASURES.values())]
+    visible = comparison.animated.measures.visible
+    caption = "Feet and pelvis over the ground, and the measures"
     return Document(
         file=TABLE,
         kind="Foot IK systems compared on one clip",
         title=comparison.title,
-        verdict=f"{len(failing)} of {len(systems)} beyond a limit"
+        verdict=f"{len(failing)} of {len(systems)} beyond a bound"
         if failing
-        else "All within limits",
+        else "All within bounds",
         good=not failing,
-        findings=findings(comparison, compared),
+        findings=findings(comparison),
         sections=[
-            _placement(compared),
+            Section(
+                "Measures",
+                [
+                    Text(MARKED),
+                    Grid(transposed([titles, *rows(comparison, measures)]), "Measures"),
+                    Plot(FIGURE, caption, lambda: overview(comparison)),
+                    Terms(meanings(MEASURES)),
+                    Text(
+                        f"`{ANIMATED}` is the animation without foot IK. A foot stands where the "
+                        "animation says so: by its contact labels or, without them, by its motion."
+                    ),
+                ],
+            ),
+            Section("Bounds", [Points(reasons(comparison.bounds))]),
             Section(
                 "Beside the captured motion",
                 [
-                    Grid(fit_figures.accuracy_table(compared.accuracy), "Accuracy", brief=False),
+                    Grid(figures_table("difference", comparison.accuracy), "Accuracy", brief=False),
                     Text("Distances and angles are root mean squares."),
                 ]
-                if compared.accuracy
+                if comparison.accuracy
                 else [],
             ),
-            _measures(comparison),
             Section(
                 "At other frame rates",
                 [Text(RATES), Grid(rate_table(comparison), "Motion at other frame rates")]
                 if comparison.rates
                 else [],
             ),
-            _worst(comparison, compared),
-            _limits(comparison, compared),
+            _worst(comparison),
+            _limits(comparison),
         ],
         asked=_asked(comparison),
-        numbers={NUMBERS: _numbers(comparison)},
+        numbers={NUMBERS: numbers(comparison)},
         view=View(
-            [shown(compared, systems, watched=worst)],
+            [shown(comparison, systems, watched=_worst_system(comparison))],
             [comparison.title],
             f"{100 * visible:.2g} cm",
         ),
     )
 
 
-def _placement(compared: ComparedMotions) -> Section:
-    placements = {name: motion.placement for name, motion in compared.motions.items()}
-    if compared.captured is not None:
-        placements["captured"] = compared.captured.placement
-    grid = Grid(fit_figures.placement_table(placements), "How feet are placed", brief=False)
-    text = (
-        "Share of the frames and, after the dot, the largest with its foot and frame. A slide or a "
-        "pop counts by how far it exceeds that of the flat animation; frames count from 0."
-    )
-    return Section("Feet on the ground", [grid, Text(text)])
-
-
-def _measures(comparison: Comparison) -> Section:
-    caption = "Feet and pelvis over the ground, and the measures"
-    return Section(
-        "Measures",
-        [
-            Grid(transposed(table(comparison)), "Measures of all systems"),
-            Plot(FIGURE, caption, lambda: overview(comparison)),
-            Terms(meanings(MEASURES)),
-            Text(
-                f"`{ANIMATED}` is the animation without foot IK, on its flat floor. A foot stands "
-                "where the animation says so: by its contact labels or, without them, by its "
-                "motion. The ground under a point is what a ray from above meets first."
-            ),
-        ],
-    )
-
-
-def _worst(comparison: Comparison, compared: ComparedMotions) -> Section:
+def _worst(comparison: Comparison) -> Section:
+    """The worst seconds of each system, and what is beyond its bounds or nearest to one."""
     blocks: list[Block] = []
-    for name in comparison.placements:
-        start, end = compared.worst[name]
-        fault, *_ = faults(compared.motions[name].placement)
-        times = f"{start / comparison.fps:.2f} to {end / comparison.fps:.2f} s"
-        text = f"`{name}`, {times}. What passes least in the whole clip: {fault.words}."
-        blocks += [Text(text), Jump(f"Show {name} in the view", 0, key(name))]
+    for name in comparison.systems:
+        start, end = _window(comparison, name)
+        fps = comparison.animation.clip.fps
+        worst, *others = comparison.against(name) or [UNKNOWN]
+        words = [worst.words, *(other.words for other in others if other.is_beyond)]
+        text = f"`{name}`, {start / fps:.2f} to {end / fps:.2f} s. In the whole clip: "
+        blocks += [
+            Text(f"{text}{'; '.join(words)}."),
+            Jump(f"Show {name} in the view", 0, key(name)),
+        ]
     return Section("The worst two seconds of each system", blocks)
 
 
-def _limits(comparison: Comparison, compared: ComparedMotions) -> Section:
+def _window(comparison: Comparison, name: str) -> tuple[int, int]:
+    motion = comparison.motions[name]
+    return worst_seconds(motion.soles, motion.clip.fps)
+
+
+def _limits(comparison: Comparison) -> Section:
     animation, clip = comparison.animation, comparison.animation.clip
     lines = [
         "The systems are compared on this clip and this ground alone; on others they may stand "
         "differently."
     ]
-    if compared.captured is None:
+    if comparison.captured is None:
         lines.append(
             "The captured motion is not known: figures say how feet stand on the ground, not "
             "whether people would move like this."
@@ -312,9 +326,9 @@ def _limits(comparison: Comparison, compared: ComparedMotions) -> Section:
         )
     if clip.stance is None:
         lines.append("The clip has no contact labels; stances are found by its motion.")
-    if comparison.groundless:
+    if groundless := comparison.animated.measures.groundless:
         lines.append(
-            f"{percent(comparison.groundless)} of the soles' points have no ground under them and "
+            f"{percent(groundless)} of the animated soles' points have no ground under them and "
             "are left out."
         )
     notes = [
@@ -330,12 +344,11 @@ def _limits(comparison: Comparison, compared: ComparedMotions) -> Section:
 
 def _asked(comparison: Comparison) -> Table:
     animation = comparison.animation
-    count = len(comparison.ground)
-    seconds = (count - 1) / comparison.fps
+    clip = animation.clip
     rows = [
         ["Clip and ground", comparison.title],
-        ["Frames", f"{count}, {seconds:.2f} s at {comparison.fps:g} Hz"],
-        ["Systems", ", ".join(f"`{name}`" for name in comparison.placements)],
+        ["Frames", f"{clip.frame_count}, {clip.seconds:.2f} s at {clip.fps:g} Hz"],
+        ["Systems", ", ".join(f"`{name}`" for name in comparison.systems)],
         ["Root", animation.root.root],
     ]
     if animation.speed != 1.0:
@@ -348,108 +361,61 @@ def _asked(comparison: Comparison) -> Table:
     return rows
 
 
-class Fault(NamedTuple):
-    """Something that a viewer may notice of a motion."""
-
-    excess: float
-    """Over the limit of what passes; above 1 it does not."""
-    words: str
-
-
-def findings(comparison: Comparison, compared: ComparedMotions) -> list[Finding]:
+def findings(comparison: Comparison) -> list[Finding]:
     """What is worst, which system stands best, and which is closest to the captured motion.
 
     Where that is not known, the last one says which system reaches its targets.
     """
-    placements = {name: compared.motions[name].placement for name in comparison.placements}
-    animated = compared.motions[ANIMATED].placement
-    last = _closeness(compared) if compared.accuracy else _reach(comparison)
-    return [_worst_finding(placements), _standing(placements, animated), last]
+    last = _closeness(comparison) if comparison.accuracy else _reach(comparison)
+    return [_worst_finding(comparison), _standing(comparison), last]
 
 
-def off_ground(placement: Placement) -> float:
-    """Fraction of the frames of standing feet in which one is visibly off the ground."""
-    return placement.sunk + placement.floating
+def beyond(comparison: Comparison) -> list[str]:
+    """Names of systems of which something is beyond its bound."""
+    return [name for name in comparison.systems if _nearest(comparison, name).is_beyond]
 
 
-def faults(placement: Placement) -> list[Fault]:
-    """All that is measured against a limit, the worst first."""
-    visible = f"{100 * placement.visible:.2g} cm"
-    deepest, highest = placement.deepest, placement.highest
-    pop, slide = placement.pop, placement.largest_slide
-    place, furthest = ("above", highest) if highest.value > deepest.value else ("in", deepest)
-    size = placement.size
-    every = [
-        Fault(
-            placement.groundless / MISSING_LIMIT,
-            f"there is no ground under {percent(placement.groundless)} of its soles",
-        ),
-        Fault(
-            off_ground(placement) / SHARE_LIMIT,
-            f"its standing feet are {visible} or more off the ground in "
-            f"{percent(off_ground(placement))} of their frames (furthest "
-            f"{100 * furthest.value:.1f} cm {place} it, {furthest.leg}, frame {furthest.frame})",
-        ),
-        Fault(
-            placement.slide / (SLIDE_LIMIT * size),
-            f"its standing feet slide by {100 * placement.slide:.1f} cm a stance more than "
-            f"animated (most {100 * slide.value:.1f} cm, {slide.leg}, frame {slide.frame})",
-        ),
-        Fault(
-            pop.value / (POP_LIMIT * size),
-            f"its feet pop by up to {100 * pop.value:.1f} cm in 1/60 s ({pop.leg}, frame "
-            f"{pop.frame})",
-        ),
-    ]
-    known = [fault for fault in every if not math.isnan(fault.excess)]
-    return sorted(known, key=lambda fault: -fault.excess)
+def _nearest(comparison: Comparison, name: str) -> Bounded:
+    """What is furthest beyond its bound, or nearest to it."""
+    return next(iter(comparison.against(name)), UNKNOWN)
 
 
-def beyond(placements: Mapping[str, Placement]) -> list[str]:
-    """Names of motions of which something is beyond its limit."""
-    return [name for name, placed in placements.items() if faults(placed)[0].excess > 1.0]
+def _worst_system(comparison: Comparison) -> str:
+    return max(comparison.systems, key=lambda name: _nearest(comparison, name).excess)
 
 
-def _worst_finding(placements: Mapping[str, Placement]) -> Finding:
-    failing = beyond(placements)
-    name = max(placements, key=lambda name: faults(placements[name])[0].excess)
-    excess, words = faults(placements[name])[0]
-    times = f"{excess:.2g} times what passes unnoticed"
+def _worst_finding(comparison: Comparison) -> Finding:
+    failing, name = beyond(comparison), _worst_system(comparison)
+    words = _nearest(comparison, name).words
     if not failing:
-        whole = "The system stays" if len(placements) == 1 else "All systems stay"
-        return Finding(
-            f"{whole} within the limits of feet off the ground, slides and pops; nearest to one "
-            f"comes `{name}`, as {words}, {times}."
-        )
+        whole = "The system stays" if len(comparison.systems) == 1 else "All systems stay"
+        return Finding(f"{whole} within all bounds; nearest to one comes `{name}`: {words}.")
     others = [f"`{other}`" for other in failing if other != name]
     also = ""
     if others:
-        also = f"; {listed(others)} {'goes' if len(others) == 1 else 'go'} beyond a limit, too"
-    return Finding(f"Worst is `{name}`: {words}, {times}{also}.", bad=True)
+        also = f"; {listed(others)} {'goes' if len(others) == 1 else 'go'} beyond a bound, too"
+    return Finding(f"Worst is `{name}`: {words}{also}.", bad=True)
 
 
-def _standing(placements: Mapping[str, Placement], animated: Placement) -> Finding:
-    shares = {name: off_ground(placed) for name, placed in placements.items()}
+def _standing(comparison: Comparison) -> Finding:
+    shares = {name: comparison.motions[name].measures.contact for name in comparison.systems}
     shares = {name: share for name, share in shares.items() if not math.isnan(share)}
-    visible = f"{100 * animated.visible:.2g} cm"
     if not shares:
         return Finding("No standing foot has ground under it, so nothing is known of them.", True)
-    best, before = min(shares, key=shares.__getitem__), off_ground(animated)
+    best, before = max(shares, key=shares.__getitem__), comparison.animated.measures.contact
     without = "" if math.isnan(before) else f", {percent(before)} without foot IK"
-    measure = f"{visible} or more off the ground in {percent(shares[best])} of their frames"
-    if shares[best] >= before:
+    measure = f"in {percent(shares[best])} of their frames{without}"
+    if shares[best] <= before:
         return Finding(
-            f"No system brings standing feet closer to the ground than the animation has them: "
-            f"with `{best}` they are {measure}{without}.",
-            bad=before > 0.0,
+            f"No system keeps standing feet on the ground better than the animation has them: "
+            f"`{best}` {measure}.",
+            bad=before < 1.0,
         )
-    if len(shares) == 1:
-        return Finding(f"Its standing feet are {measure}{without}.")
-    return Finding(f"`{best}` places standing feet best: they are {measure}{without}.")
+    return Finding(f"`{best}` keeps standing feet on the ground best: {measure}.")
 
 
-def _closeness(compared: ComparedMotions) -> Finding:
-    distances = {name: of.ankle for name, of in compared.accuracy.items()}
+def _closeness(comparison: Comparison) -> Finding:
+    distances = {name: of.ankle for name, of in comparison.accuracy.items()}
     before = distances.pop(ANIMATED)
     best, worst = (choose(distances, key=distances.__getitem__) for choose in (min, max))
     without = f"; without foot IK it is {100 * before:.1f} cm"
@@ -468,23 +434,23 @@ def _closeness(compared: ComparedMotions) -> Finding:
 
 
 def _reach(comparison: Comparison) -> Finding:
-    shares = {name: comparison.measures[name].reached for name in comparison.placements}
+    shares = {name: comparison.motions[name].measures.reached for name in comparison.systems}
     shares = {name: share for name, share in shares.items() if not math.isnan(share)}
     if not shares:
-        return Finding("No foot has a target, as there is no ground under any.", bad=True)
+        return Finding("No standing foot has a target, as there is no ground under any.", bad=True)
     best, least = (choose(shares, key=shares.__getitem__) for choose in (max, min))
-    text = f"`{best}` reaches {percent(shares[best])} of the targets of its ankles"
+    text = f"`{best}` reaches {percent(shares[best])} of the targets of its standing feet"
     if len(shares) > 1:
         text += f", the most of all, and `{least}` {percent(shares[least])}, the fewest"
     unknown = "how close that is to captured motion is not known, as there is none to compare with"
     return Finding(f"{text}; {unknown}.")
 
 
-def shown(compared: ComparedMotions, systems: tuple[str, ...], watched: str) -> ShownClip:
+def shown(comparison: Comparison, systems: tuple[str, ...], watched: str) -> ShownClip:
     """What the view shows: colours are those of the plots.
 
     Args:
-        compared: the motions.
+        comparison: with the motions.
         systems: names of all systems, which decide the colours.
         watched: the one that is watched at first, if it gave a motion.
     """
@@ -498,19 +464,22 @@ def shown(compared: ComparedMotions, systems: tuple[str, ...], watched: str) -> 
             motion,
             looks[name],
             visible=name != ANIMATED,
-            worst=compared.worst[name],
+            worst=_window(comparison, name),
         )
-        for name, motion in compared.motions.items()
+        for name, motion in comparison.motions.items()
     }
-    if compared.captured is not None:
+    if comparison.captured is not None:
         motions[CAPTURE] = ShownMotion(
-            "captured", compared.captured, motion_data.CAPTURED, visible=True
+            "captured", comparison.captured, motion_data.CAPTURED, visible=True
         )
+    # Rays start above the highest motion, so that one inside a hill does not hide the hill.
+    clips = [motion.clip for motion in comparison.motions.values()]
+    highest = max(clips, key=lambda clip: float(clip.positions_ws[..., 1].max()))
     return ShownClip(
         motions,
-        compared.stance,
-        compared.ground,
-        watched=key(watched if watched in compared.motions else ANIMATED),
+        comparison.animated.clip.stance_labels(),
+        ground_patch.around_path(highest, comparison.animation.terrain),
+        watched=key(watched if watched in comparison.motions else ANIMATED),
     )
 
 

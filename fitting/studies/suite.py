@@ -1,66 +1,31 @@
-"""Runs systems through situations, and measures what comes out against its bounds.
+"""Runs systems through made situations, and measures what comes out against its bounds.
 
-How good is good enough: one bound for each measure, with its reason.
+The bounds of `fitting.motion.measures` say what a viewer notices, and what the animation and the
+ground ask of any motion that puts the feet on the ground; none was chosen by what a system reaches.
 
-None of them was chosen by what a system reaches. They say what a viewer notices, and what the
-animation and the ground ask of any motion that puts the feet on the ground.
-
-Grounds of the suite: functions of the place, sampled on one grid.
-
-All have the same grid, so that one compiled program runs a system on any of them. Along the path it
-is so fine that a riser of stairs is one centimetre deep.
+The grounds are functions of the place, sampled on one grid, so that one compiled program runs a
+system on any of them. Along the path it is so fine that a riser of stairs is one centimetre deep.
 """
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
 
 import jaxik
-from fitting.clips import contacts
 from fitting.clips.assemble import JointMotion, clip_from_joints
 from fitting.clips.clip import Clip
 from fitting.ground.ground_path import place_root
-from fitting.motion import measures
-from fitting.motion.measures import (
-    SHARE_LIMIT,
-    SLIDE_LIMIT,
-    VISIBLE,
-    Cause,
-    Extreme,
-    Placement,
-    Soles,
-)
+from fitting.motion.measures import BOUNDED, Bounded
 from fitting.runtime import activity
 from fitting.synthetic import actions, walker
 from fitting.synthetic.footsteps import smoothstep
 from jaxik.world.terrain import Terrain, heightfield
 
 from .animations import Animation
-
-FLAT_SLIDE = 0.002  # m
-POP = 0.01  # m in 1/60 s
-SWING_PEAK = 1.875  # speed of a path of minimum jerk at its middle, over its mean speed
-WALK_JERK = 80.0  # m/s³, of the pelvis in our walk over a flat floor
-MISSED = 0.05  # of the targets of standing feet
-
-REASONS = {
-    "penetration": f"in at most {SHARE_LIMIT:.0%} of the frames may a sole be {100 * VISIBLE:.0f} "
-    "cm or more in the ground, which a viewer notices",
-    "float": f"in at most {SHARE_LIMIT:.0%} of its frames may a standing sole be "
-    f"{100 * VISIBLE:.0f} cm or more above the ground",
-    "slide": f"in a stance a foot may slide {1000 * FLAT_SLIDE:.0f} mm further than animated on a "
-    f"level floor, where nothing has to move it, and {100 * SLIDE_LIMIT:.0f} cm elsewhere",
-    "pop": f"in 1/60 s a foot's correction may change by {100 * POP:.0f} cm, beyond what a smooth "
-    "swing from one foothold to the next needs on this ground",
-    "jerk": f"the pelvis may have the animation's jerk and {WALK_JERK:.0f} m/s³ more, as much as a "
-    "walk over a level floor has itself",
-    "reach": f"at most {MISSED:.0%} of the targets of standing feet may be missed, by 5 mm or more",
-}
-"""What each bound is and why, by measure."""
+from .comparison import Comparison, compare
 
 SPACING = 0.05, 0.01  # m, across the path and along it
 HALF_WIDTH, BEHIND, AHEAD = 2.0, 3.0, 17.0  # m, around the origin
@@ -92,86 +57,6 @@ Vehicle = Callable[[np.ndarray], np.ndarray]
 
 SystemsOf: TypeAlias = Callable[[jaxik.Rig], Mapping[str, jaxik.FootIK]]
 """Makes systems for the body of a rig, by name."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One measure of one motion, and its bound."""
-
-    value: float
-    """In SI units or fractions of 1; NaN where there is nothing to measure."""
-    bound: float
-    """Largest value that is good enough; of `reach`, the smallest."""
-    worst: Extreme | None = None
-    """Where the motion is worst, for measures that know."""
-    is_least: bool = False
-    """Whether the bound is the smallest value."""
-
-    @property
-    def is_within(self) -> bool:
-        """Whether the value is good enough; true where there is nothing to measure."""
-        if math.isnan(self.value):
-            return True
-        return self.value >= self.bound if self.is_least else self.value <= self.bound
-
-
-def cells(
-    placed: Placement, jerk: float, reached: float, bounds: Mapping[str, float]
-) -> dict[str, Cell]:
-    """The cells of a motion, by measure.
-
-    Args:
-        placed: how its feet are placed.
-        jerk: of the height of its pelvis, m/s³.
-        reached: fraction of the targets of its standing feet.
-        bounds: of its situation; see `bounds_of`.
-    """
-    return {
-        "penetration": Cell(placed.sunk_frames, bounds["penetration"], placed.deepest),
-        "float": Cell(placed.floating, bounds["float"], placed.highest),
-        "slide": Cell(placed.slide, bounds["slide"], placed.largest_slide),
-        "pop": Cell(placed.pop.value, bounds["pop"], placed.pop),
-        "jerk": Cell(jerk, bounds["jerk"]),
-        "reach": Cell(reached, bounds["reach"], is_least=True),
-    }
-
-
-def bounds_of(animation: Animation, *, is_flat: bool) -> dict[str, float]:
-    """The bounds of a situation, by measure, in SI units and fractions of 1.
-
-    They depend on the animation and the ground alone, so that every system has the same.
-    """
-    return {
-        "penetration": SHARE_LIMIT,
-        "float": SHARE_LIMIT,
-        "slide": FLAT_SLIDE if is_flat else SLIDE_LIMIT,
-        "pop": POP + swing_speed(animation) * measures.TICK,
-        "jerk": pelvis_jerk(animation.placed_clip) + WALK_JERK,
-        "reach": 1.0 - MISSED,
-    }
-
-
-def pelvis_jerk(clip: Clip) -> float:
-    """Jerk of the height of a clip's pelvis, m/s³."""
-    return measures.jerk(clip.positions_ws[:, clip.rig.pelvis, 1], clip.fps, clip.cuts)
-
-
-def swing_speed(animation: Animation) -> float:
-    """How fast corrections must change, m/s, for swings between footholds on the ground.
-
-    A standing ball needs a correction of as much as it is in the ground. Between two stances that
-    changes along a path of minimum jerk, whose fastest moment counts; of all swings, the largest.
-    """
-    clip = animation.placed_clip
-    needed = -measures.soles(clip, animation.clip, animation.terrain, animation.floor).height
-    stance, fastest = clip.stance_labels(), 0.0
-    for leg in range(stance.shape[1]):
-        runs = contacts.runs(stance[:, leg])
-        for (_, last), (first, _) in zip(runs, runs[1:], strict=False):
-            change = abs(needed[first, leg, 1] - needed[last, leg, 1])
-            if not np.isnan(change):
-                fastest = max(fastest, float(SWING_PEAK * change * clip.fps / (first - last)))
-    return fastest
 
 
 def sampled(height: HeightAt) -> Terrain:
@@ -253,18 +138,13 @@ class Situation:
     vehicle: Vehicle | None = None
     """What carries ground and character."""
 
-    @property
-    def is_flat(self) -> bool:
-        """Whether the ground is a level floor, on which nothing needs a correction."""
-        return self.height is flat
-
     def animation(self, seconds: float) -> Animation:
         """The animation, with its root where the commands put it."""
         terrain = sampled(self.height)
         clip, root = place_root(self.animate(seconds), terrain)
         times = np.arange(clip.frame_count) / clip.fps
         carried = None if self.vehicle is None else self.vehicle(times)
-        return Animation(clip, terrain, root=root, carried=carried)
+        return Animation(clip, terrain, root=root, carried=carried, is_made=True)
 
 
 class Plan(NamedTuple):
@@ -359,33 +239,25 @@ def choose(only: str | None = None, *, quick: bool = False) -> Plan:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a system made of a situation."""
-
-    clip: Clip
-    """The solved motion."""
-    soles: Soles
-    placement: Placement
-    cause: Cause | None
-    """Why feet are off their ground; None where they are not."""
-    cells: Mapping[str, Cell]
-    """By measure."""
-
-
-@dataclass(frozen=True)
 class Scene:
-    """A situation, what it asks, and what the systems made of it."""
+    """A situation, and what the systems made of it."""
 
     situation: Situation
-    animation: Animation
-    systems: tuple[str, ...]
-    """Names, in their order."""
-    bounds: Mapping[str, float]
-    """By measure."""
-    outcomes: dict[str, Outcome] = field(default_factory=dict)
-    """By system."""
-    failures: dict[str, str] = field(default_factory=dict)
-    """What went wrong, of systems that gave no motion."""
+    comparison: Comparison
+
+    @property
+    def systems(self) -> tuple[str, ...]:
+        """Names, in their order."""
+        return (*self.comparison.systems, *self.comparison.failures)
+
+    def beyond(self, system: str) -> list[Bounded]:
+        """What is beyond its bound, the worst first; of a system that gave a motion."""
+        return [bounded for bounded in self.comparison.against(system) if bounded.is_beyond]
+
+    def count(self, system: str) -> int:
+        """How many measures of a system are beyond their bounds; all, if it gave no motion."""
+        failed = system in self.comparison.failures
+        return len(BOUNDED) if failed else len(self.beyond(system))
 
 
 @dataclass(frozen=True)
@@ -393,21 +265,17 @@ class Suite:
     """All scenes that are finished, in order."""
 
     plan: Plan
+    systems: tuple[str, ...]
+    """Names, in their order; none before the first scene is finished."""
     scenes: tuple[Scene, ...]
     interrupted: bool = False
 
     @property
-    def systems(self) -> tuple[str, ...]:
-        """Names of the systems, in their order; none before the first scene is finished."""
-        return self.scenes[0].systems if self.scenes else ()
-
-    @property
     def counts(self) -> tuple[int, int]:
-        """How many cells are within their bounds, and how many there are."""
-        outcomes = [outcome for scene in self.scenes for outcome in scene.outcomes.values()]
-        every = [cell for outcome in outcomes for cell in outcome.cells.values()]
-        failed = sum(len(scene.failures) * len(scene.bounds) for scene in self.scenes)
-        return sum(bool(cell.is_within) for cell in every), len(every) + failed
+        """How many measures are within their bounds, and how many there are."""
+        count = len(BOUNDED) * len(self.systems) * len(self.scenes)
+        beyond = sum(scene.count(system) for scene in self.scenes for system in self.systems)
+        return count - beyond, count
 
 
 def run_suite(systems_of: SystemsOf, plan: Plan) -> Suite:
@@ -420,37 +288,19 @@ def run_suite(systems_of: SystemsOf, plan: Plan) -> Suite:
         systems_of: makes the systems for a body.
         plan: which situations, and how long they are.
     """
+    names: tuple[str, ...] = ()
     scenes: list[Scene] = []
+    interrupted = False
     try:
         total = len(plan.situations)
         with activity.announced(f"Running {total} situations", total) as running:
             for situation in plan.situations:
                 with running.part(situation.name):
-                    scenes.append(_run(situation, systems_of, plan.seconds))
+                    animation = situation.animation(plan.seconds)
+                    systems = systems_of(animation.clip.rig)
+                    names = tuple(systems)
+                    compared = compare(systems, animation, title=situation.name, keep_going=True)
+                    scenes.append(Scene(situation, compared))
     except KeyboardInterrupt:
-        return Suite(plan, tuple(scenes), interrupted=True)
-    return Suite(plan, tuple(scenes))
-
-
-def _run(situation: Situation, systems_of: SystemsOf, seconds: float) -> Scene:
-    animation = situation.animation(seconds)
-    systems = systems_of(animation.clip.rig)
-    bounds = bounds_of(animation, is_flat=situation.is_flat)
-    scene = Scene(situation, animation, tuple(systems), bounds)
-    for name, ik in systems.items():
-        try:
-            scene.outcomes[name] = _outcome(animation, ik, bounds)
-        except ValueError as error:
-            scene.failures[name] = str(error)
-    return scene
-
-
-def _outcome(animation: Animation, ik: jaxik.FootIK, bounds: Mapping[str, float]) -> Outcome:
-    animation.check_shapes(ik)
-    result, solved = animation.solve(ik)
-    placed, cause = animation.assess(solved)
-    soles = measures.soles(solved, animation.clip, animation.terrain, animation.floor)
-    reached = animation.reached(result)[animation.clip.stance_labels()]
-    share = float(np.nanmean(reached)) if not np.isnan(reached).all() else float("nan")
-    measured = cells(placed, pelvis_jerk(solved), share, bounds)
-    return Outcome(solved, soles, placed, cause, measured)
+        interrupted = True
+    return Suite(plan, names if scenes else (), tuple(scenes), interrupted)

@@ -1,6 +1,5 @@
 """The report of the suite: a table with its explanation, the numbers, and a page of pictures."""
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -11,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.ground import ground_path
-from fitting.motion.measures import VISIBLE
+from fitting.motion.measures import BOUNDED, MEASURES, VISIBLE, PlacedMotion
 from fitting.report.document import (
     Document,
     Finding,
@@ -23,47 +22,17 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import Column, Table, meanings
+from fitting.report.formatting import Table, meanings
 from fitting.report.style import BEFORE, EARTH, GROUND, STAGES, earth, legend, styled
 from fitting.runtime.precision import in_float64
 
-from . import comparison, comparison_report
-from .animations import numbers as placement_numbers
+from . import comparison_report
+from .comparison import ANIMATED
+from .comparison_report import BOUND, MARKED, MISS
 from .fit.sentences import listed
-from .suite import REASONS, Cell, Outcome, Scene, Suite
+from .suite import Scene, Suite
 
 TABLE, NUMBERS, PAGE = "suite.md", "suite.json", "suite.png"
-
-MISS = "!"
-BOUND = "bound"
-_SEEN = f"{100 * VISIBLE:.0f} cm or more"
-
-MEASURES = {
-    "penetration": Column(
-        "in the ground", "% of frames", 100.0, 1,
-        f"Frames in which any foot is {_SEEN} in the ground.",
-    ),
-    "float": Column(
-        "above it", "% of stances", 100.0, 1,
-        f"Frames of standing feet in which they are {_SEEN} above the ground.",
-    ),
-    "slide": Column(
-        "slide", "cm a stance", 100.0, 2,
-        "Horizontal path of the ball of the foot in a stance beyond the animated one; median.",
-    ),
-    "pop": Column(
-        "pop", "cm in 1/60 s", 100.0, 1,
-        "Largest change of an ankle's correction, relative to the pelvis.",
-    ),
-    "jerk": Column(
-        "jerk", "m/s³", 1.0, 0,
-        "Third derivative of the height of the pelvis, root mean square.",
-    ),
-    "reach": Column(
-        "reached", "%", 100.0, 1,
-        "Ankle targets of standing feet that the system reports as reached.",
-    ),
-}  # fmt: skip
 
 RED = "#CC0000"
 OFF = f"sole off its ground by {100 * VISIBLE:.0f} cm"
@@ -81,11 +50,21 @@ SAMPLES = 600  # of the ground
 def missed(suite: Suite) -> list[str]:
     """What is beyond its bound, a line each."""
     return [
-        f"{scene.situation.name}, {system}: {miss}"
+        f"{scene.situation.name}, {system}: {words}"
         for scene in suite.scenes
         for system in suite.systems
-        for miss in misses(scene, system)
+        for words in misses(scene, system)
     ]
+
+
+def misses(scene: Scene, system: str) -> list[str]:
+    """What is beyond its bound, a phrase each, and the likely cause of feet off the ground."""
+    compared = scene.comparison
+    if system in compared.failures:
+        return [f"no motion: {compared.failures[system]}"]
+    cause = compared.causes[system]
+    known = [] if cause is None or cause.kind == "unknown" else [f"likely cause: {cause.kind}"]
+    return [*(bounded.words for bounded in scene.beyond(system)), *known]
 
 
 def _numbers(suite: Suite) -> dict[str, Any]:
@@ -94,96 +73,24 @@ def _numbers(suite: Suite) -> dict[str, Any]:
     return {
         "seconds": suite.plan.seconds,
         "interrupted": suite.interrupted,
-        "cells": count,
+        "measures": count,
         "within": within,
-        "situations": [_scene_numbers(scene) for scene in suite.scenes],
+        "situations": [comparison_report.numbers(scene.comparison) for scene in suite.scenes],
     }
-
-
-def _scene_numbers(scene: Scene) -> dict[str, Any]:
-    systems: dict[str, Any] = {
-        name: {
-            "cells": {
-                key: {"value": _null(cell.value), "within": cell.is_within}
-                for key, cell in outcome.cells.items()
-            },
-            "placement": placement_numbers(outcome.placement),
-            "cause": None if outcome.cause is None else outcome.cause.kind,
-        }
-        for name, outcome in scene.outcomes.items()
-    }
-    systems |= {name: {"failure": failure} for name, failure in scene.failures.items()}
-    return {
-        "name": scene.situation.name,
-        "root": scene.animation.root.reason,
-        "bounds": dict(scene.bounds),
-        "systems": systems,
-    }
-
-
-def _null(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-assert MEASURES.keys() == REASONS.keys()
 
 
 def table(suite: Suite) -> Table:
     """The measures: for each situation a row with its bounds and a row for each system."""
-    headings = [f"{column.heading}, {column.unit}" for column in MEASURES.values()]
-    rows = [["situation", "system", *headings]]
+    rows = [["situation", "system", *(measure.title for measure in BOUNDED.values())]]
     for scene in suite.scenes:
-        limits = [_limit(key, bound) for key, bound in scene.bounds.items()]
-        rows.append([scene.situation.name, BOUND, *limits])
-        for system in suite.systems:
-            rows.append(["", system, *cells_text(scene, system)])
+        of_system = {name: cells for name, *cells in _rows(scene)}
+        rows.append([scene.situation.name, BOUND, *of_system[BOUND]])
+        rows += [["", system, *of_system[system]] for system in suite.systems]
     return rows
 
 
-def cells_text(scene: Scene, system: str) -> list[str]:
-    """The cells of a system in a situation, with marks."""
-    if system in scene.failures:
-        return [f"none{MISS}"] * len(MEASURES)
-    cells = scene.outcomes[system].cells
-    return [MEASURES[key].format(cells[key].value) + mark(cells[key]) for key in MEASURES]
-
-
-def mark(cell: Cell) -> str:
-    """An exclamation mark for a cell beyond its bound."""
-    return "" if cell.is_within else MISS
-
-
-def misses(scene: Scene, system: str) -> list[str]:
-    """What misses its bound, a phrase each, with where it is worst and the likely cause."""
-    if system in scene.failures:
-        return [f"no motion: {scene.failures[system]}"]
-    outcome = scene.outcomes[system]
-    return [
-        _miss(key, cell, cause="" if outcome.cause is None else outcome.cause.kind)
-        for key, cell in outcome.cells.items()
-        if not cell.is_within
-    ]
-
-
-def reasons() -> list[str]:
-    """Each bound and its reason, a sentence each."""
-    return [f"{MEASURES[key].heading}: {reason}" for key, reason in REASONS.items()]
-
-
-def _limit(key: str, bound: float) -> str:
-    return ("≥ " if key == "reach" else "≤ ") + MEASURES[key].format(bound)
-
-
-def _miss(key: str, cell: Cell, cause: str) -> str:
-    column = MEASURES[key]
-    text = f"{column.heading} {column.format(cell.value)} {column.unit} ({_limit(key, cell.bound)})"
-    if cell.worst is not None and not math.isnan(cell.worst.value):
-        text += (
-            f", worst {100 * cell.worst.value:.1f} cm, {cell.worst.leg}, frame {cell.worst.frame}"
-        )
-    if cause not in ("", "unknown") and key in ("penetration", "float"):
-        text += f", likely cause: {cause}"
-    return text
+def _rows(scene: Scene) -> Table:
+    return comparison_report.rows(scene.comparison, list(BOUNDED))
 
 
 @styled
@@ -198,7 +105,7 @@ def page(suite: Suite) -> Figure:
     for scene, row in zip(suite.scenes, panels, strict=True):
         row[0].set_ylim(_heights(scene))
         for system, axes in zip(suite.systems, row, strict=True):
-            _panel(axes, scene, scene.outcomes.get(system))
+            _panel(axes, scene, system)
         row[0].set_ylabel(f"{scene.situation.name}\nheight, m", fontsize=10)
     for system, axes in zip(suite.systems, panels[0], strict=True):
         axes.annotate(system, HEAD, xycoords="axes fraction", ha="center", fontsize=15)
@@ -216,12 +123,13 @@ def page(suite: Suite) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, scene: Scene, outcome: Outcome | None) -> None:
+def _panel(axes: Axes, scene: Scene, system: str) -> None:
     axes.tick_params(labelsize=8)
-    if outcome is None:
+    if system in scene.comparison.failures:
         _title(axes, ["no motion"])
         return
-    clip, soles = outcome.clip, outcome.soles
+    motion = scene.comparison.motions[system]
+    clip, soles, visible = motion.clip, motion.soles, motion.measures.visible
     pelvis, balls = clip.positions_ws[:, clip.rig.pelvis], clip.joints_ws(3)
     _line(axes, pelvis, color="black", linewidth=1.2)
     for leg, ankle in enumerate(np.moveaxis(clip.joints_ws(2), 1, 0)):
@@ -230,23 +138,21 @@ def _panel(axes: Axes, scene: Scene, outcome: Outcome | None) -> None:
         sole[:, 1] = soles.height[:, leg, 1] + soles.ground[:, leg, 1]
         _line(axes, sole, color=SOLES[leg % len(SOLES)], linewidth=1.0)
         gap = soles.gap[:, leg]
-        off = (gap < -VISIBLE) | (soles.stance[:, leg] & (gap > VISIBLE))
+        off = (gap < -visible) | (soles.stance[:, leg] & (gap > visible))
         axes.plot(sole[off, 2], sole[off, 1], ".", color=RED, markersize=3)
     middle = (balls[..., 2].min() + balls[..., 2].max()) / 2
     reach = max(NARROWEST / 2, np.ptp(balls[..., 2]) / 2 + MARGIN)
     points = np.zeros((SAMPLES, 3))
     points[:, 2] = middle + np.linspace(-reach, reach, SAMPLES)
     axes.set_xlim(points[0, 2], points[-1, 2])
-    ground = ground_path.heights_under(scene.animation.terrain, points, ground_path.SKY)
+    ground = ground_path.heights_under(scene.comparison.animation.terrain, points, ground_path.SKY)
     earth(axes, points[:, 2], ground)
-    missed = [key for key, cell in outcome.cells.items() if not cell.is_within]
-    _title(
-        axes,
-        [
-            f"{MEASURES[key].heading} {MEASURES[key].format(outcome.cells[key].value)}{MISS}"
-            for key in missed
-        ],
-    )
+    _title(axes, [_short(motion, bounded.name) for bounded in scene.beyond(system)])
+
+
+def _short(motion: PlacedMotion, name: str) -> str:
+    measure = MEASURES[name]
+    return f"{measure.heading} {measure.format(getattr(motion.measures, name))}{MISS}"
 
 
 def _line(axes: Axes, points: np.ndarray, **look: Any) -> None:
@@ -258,7 +164,8 @@ def _line(axes: Axes, points: np.ndarray, **look: Any) -> None:
 
 def _heights(scene: Scene) -> tuple[float, float]:
     """The range of heights of a row, m."""
-    clips = [outcome.clip for outcome in scene.outcomes.values()] or [scene.animation.placed_clip]
+    motions = scene.comparison.motions
+    clips = [motions[name].clip for name in scene.comparison.systems or [ANIMATED]]
     highest = max(float(clip.positions_ws[:, clip.rig.pelvis, 1].max()) for clip in clips)
     lowest = min(float(clip.joints_ws(3)[..., 1].min()) for clip in clips)
     return lowest - MARGIN, highest + MARGIN / 2
@@ -289,16 +196,13 @@ def document(suite: Suite) -> Document:
             Section(
                 "All situations",
                 [
-                    Text(
-                        f"What is marked ({MISS}) is beyond its bound, which stands in the first "
-                        "row of a situation."
-                    ),
+                    Text(f"{MARKED} Bounds stand in the first row of a situation."),
                     Grid(table(suite), "Measures of all systems in all situations"),
                     *(plots if suite.scenes else []),
-                    Terms(meanings(MEASURES)),
+                    Terms(meanings(BOUNDED)),
                 ],
             ),
-            Section("Bounds", [Points(reasons(), brief=True)]),
+            Section("Bounds", [Points(comparison_report.reasons(), brief=True)]),
             Section("Beyond their bounds", [Points(missed(suite) or ["Nothing."])]),
             _limits(suite),
         ],
@@ -309,11 +213,11 @@ def document(suite: Suite) -> Document:
 
 
 def findings(suite: Suite) -> list[Finding]:
-    """How many cells miss their bounds and whose, where that is worst, where all is well."""
+    """How many measures miss their bounds and whose, where that is worst, where all is well."""
     if not suite.scenes:
         return [Finding("No situation was finished, so nothing was found.", bad=True)]
     within, count = suite.counts
-    text = f"{count - within} of {count} cells are beyond their bounds"
+    text = f"{count - within} of {count} measures are beyond their bounds"
     of_system = _counts(suite)
     worst, best = (choose(of_system, key=of_system.__getitem__) for choose in (max, min))
     if within < count and len(of_system) > 1:
@@ -329,28 +233,22 @@ def findings(suite: Suite) -> list[Finding]:
 
 
 def _counts(suite: Suite) -> Counter[str]:
-    """How many cells of each system miss their bounds."""
-    counts = Counter({system: 0 for system in suite.systems})
-    for scene in suite.scenes:
-        for system in suite.systems:
-            counts[system] += _count(scene, system)
-    return counts
-
-
-def _count(scene: Scene, system: str) -> int:
-    return sum(cell.endswith(MISS) for cell in cells_text(scene, system))
+    """How many measures of each system miss their bounds."""
+    return Counter(
+        {name: sum(scene.count(name) for scene in suite.scenes) for name in suite.systems}
+    )
 
 
 def _hardest(suite: Suite) -> Finding:
-    counts = [sum(_count(scene, system) for system in suite.systems) for scene in suite.scenes]
+    counts = [sum(map(scene.count, suite.systems)) for scene in suite.scenes]
     most = max(counts)
     if not most:
         return Finding("No situation makes any system miss a bound.")
     scene = suite.scenes[counts.index(most)]
-    cells = len(suite.systems) * len(MEASURES)
-    text = f"Hardest is `{scene.situation.name}`, with {most} of {cells} cells beyond their bounds"
-    if scene.failures:
-        text += f"; {listed([f'`{name}`' for name in scene.failures])} gave no motion there"
+    count = len(suite.systems) * len(BOUNDED)
+    text = f"Hardest is `{scene.situation.name}`, with {most} of {count} measures beyond bounds"
+    if failures := scene.comparison.failures:
+        text += f"; {listed([f'`{name}`' for name in failures])} gave no motion there"
     return Finding(f"{text}.", bad=True)
 
 
@@ -358,7 +256,7 @@ def _easy(suite: Suite) -> Finding:
     names = [
         f"`{scene.situation.name}`"
         for scene in suite.scenes
-        if not any(_count(scene, system) for system in suite.systems)
+        if not any(map(scene.count, suite.systems))
     ]
     if not names:
         return Finding("In no situation are all systems within all bounds.", bad=True)
@@ -369,7 +267,7 @@ def _view(suite: Suite) -> View:
     counts = _counts(suite)
     worst = max(counts, key=counts.__getitem__)
     clips = [
-        comparison_report.shown(comparison.of_scene(scene), suite.systems, watched=worst)
+        comparison_report.shown(scene.comparison, suite.systems, watched=worst)
         for scene in suite.scenes
     ]
     names = [scene.situation.name for scene in suite.scenes]
@@ -384,7 +282,7 @@ def _limits(suite: Suite) -> Section:
         "may do better there.",
         "On vehicles the view shows the character as the vehicle's passengers see it.",
     ]
-    roots = dict.fromkeys(scene.animation.root.reason for scene in suite.scenes)
+    roots = dict.fromkeys(scene.comparison.animation.root.reason for scene in suite.scenes)
     if roots:
         lines.append(f"Roots: {'; '.join(roots)}.")
     return Section("Limits of the data", [Points(lines)])

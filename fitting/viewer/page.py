@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import io
-import math
 import re
 import socket
 import threading
@@ -23,8 +22,7 @@ import jaxik
 from fitting.ground import ground_patch
 from fitting.ground.ground_patch import GroundPatch
 from fitting.ground.meshes import grid_faces
-from fitting.motion.measures import Placement
-from fitting.report.formatting import markdown, percent
+from fitting.report.formatting import figures_table, markdown, transposed
 from fitting.runtime.precision import in_float64
 from jaxik.world import body
 
@@ -52,7 +50,7 @@ Moved = Callable[[Knob, float | bool], object]
 RATE = 30.0  # Hz, at which frames are drawn at most
 
 MARKS = re.compile(r"([\\`*_{}\[\]<>()#+.!|~&-])")
-HEADING = ["", "in the ground", "deepest", "slide", "largest"]
+SHOWN = "penetration", "contact", "slide"  # of each motion
 
 ANY_PORT = 0
 OWN = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
@@ -495,8 +493,8 @@ def cost_text(solver: Solver, solved: Solved, costs: Mapping[str, float]) -> str
         costs: of systems to compare with, by name.
     """
     motions = {"before": solver.before, "after": solved.motion, "captured": solver.captured}
-    rows = [[name, *_row(drawn.placement)] for name, drawn in motions.items() if drawn is not None]
-    table = markdown([HEADING, *rows])
+    measured = {name: drawn.measures for name, drawn in motions.items() if drawn is not None}
+    table = markdown(transposed(figures_table("", measured, SHOWN)))
     return "\n\n".join([_cost(solved, costs), table])
 
 
@@ -506,19 +504,6 @@ def _cost(solved: Solved, costs: Mapping[str, float]) -> str:
         return took[0].upper() + took[1:]
     others = ", ".join(f"{name} {cost:.6g}" for name, cost in costs.items())
     return f"**Cost {solved.cost:.6g}**{f' ({others})' if others else ''}, {took}"
-
-
-def _row(placed: Placement) -> list[str]:
-    lengths = (placed.deepest.value, placed.slide, placed.largest_slide.value)
-    return [_percent(placed.sunk), *map(_centimetres, lengths)]
-
-
-def _percent(share: float) -> str:
-    return "–" if math.isnan(share) else percent(share)
-
-
-def _centimetres(length: float) -> str:
-    return "–" if math.isnan(length) else f"{100 * max(length, 0.0):.1f} cm"
 
 
 class Latest:

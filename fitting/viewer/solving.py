@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 import jaxik
-from fitting.clips import Clip, contacts
+from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result
 from fitting.motion import measures
-from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Placement, Soles
+from fitting.motion.measures import VISIBLE, Measures, PlacedMotion, Soles
 from fitting.motion.playback import stage_outputs
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64
@@ -58,13 +58,13 @@ class Sight:
 
     @property
     def sunk(self) -> Float64[np.ndarray, "frames legs"]:
-        """How far a foot is in the ground, 0..1; 1 where `placement` counts it."""
+        """How far a foot is in the ground, 0..1; 1 where it counts as penetration."""
         return np.clip(self.depth / (VISIBLE * self.size), 0.0, 1.0)
 
     @property
     def slid(self) -> Float64[np.ndarray, "frames legs"]:
-        """How far a standing foot has slid, 0..1; 1 at the limit of `placement`."""
-        return np.clip(self.slide / (SLIDE_LIMIT * self.size), 0.0, 1.0)
+        """How far a standing foot has slid, 0..1; 1 at the bound of a slide."""
+        return np.clip(self.slide / (VISIBLE * self.size), 0.0, 1.0)
 
     def colours(self, plain: tuple[int, int, int]) -> UInt8[np.ndarray, "frames legs 3"]:
         """The colour of each foot: plain, the redder the deeper, the more purple the further slid.
@@ -87,13 +87,7 @@ def seen(feet: Soles, motion: Clip, animated: Clip) -> Sight:
         animated: whose slides are not counted.
     """
     depth = np.maximum(-np.nan_to_num(feet.gap), 0.0)
-    steps = measures.horizontal_steps(motion.joints_ws(3), motion.cuts)
-    steps = steps - measures.horizontal_steps(animated.joints_ws(3), animated.cuts)
-    slide = np.zeros(depth.shape)
-    for leg in range(len(motion.rig.names)):
-        for first, last in contacts.runs(feet.stance[:, leg]):
-            slide[first + 1 : last + 1, leg] = np.cumsum(steps[first:last, leg])
-    slide[~feet.stance] = 0.0
+    slide = np.nan_to_num(measures.travelled(motion, animated, feet.stance))
     return Sight(depth, np.maximum(slide, 0.0), body.ratio(motion.rig))
 
 
@@ -105,7 +99,7 @@ class Drawn:
     feet: Lines
     """Coloured by what is wrong with them."""
     sight: Sight
-    placement: Placement
+    measures: Measures
 
 
 @dataclass(frozen=True)
@@ -161,13 +155,12 @@ class Solver:
     @in_float64
     def _drawn(self, clip: Clip, name: str) -> Drawn:
         take = self.take
-        soles = measures.soles(clip, take.own_speed, take.terrain, take.floor)
-        placed = measures.assess(soles, clip, take.animated, own_speed=take.own_speed)
-        sight = seen(soles, clip, take.own_speed)
+        placed = measures.place(clip, take.animated, take.own_speed, take.terrain, take.floor)
+        sight = seen(placed.soles, clip, take.own_speed)
         bones = np.array([[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0])
         starts, ends = np.moveaxis(clip.positions_ws[:, bones], 2, 0)
-        feet = _feet(clip, sight.colours(SKELETONS[name]))
-        return Drawn(lines(starts, ends, SKELETONS[name]), feet, sight, placed)
+        feet = _feet(placed, sight.colours(SKELETONS[name]))
+        return Drawn(lines(starts, ends, SKELETONS[name]), feet, sight, placed.measures)
 
 
 @in_float64
@@ -178,11 +171,10 @@ def result_of(ik: jaxik.FootIK, take: Take) -> jaxik.Result:
     return program_cache.run(own, rig, take.terrain, take.frames, tracks=tracks)
 
 
-def _feet(clip: Clip, colours: np.ndarray) -> Lines:
+def _feet(motion: PlacedMotion, colours: np.ndarray) -> Lines:
     """The soles of a motion, in a colour for each foot in each frame."""
-    heel_and_ball = measures.sole_points(clip)
-    joints = np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
-    corners = np.concatenate([heel_and_ball, joints], axis=2)
+    joints = np.stack([motion.clip.joints_ws(2), motion.clip.joints_ws(3)], axis=2)
+    corners = np.concatenate([motion.soles.points_ws, joints], axis=2)
     return joined(
         *(lines(corners[:, :, start], corners[:, :, end], colours) for start, end in EDGES)
     )

@@ -289,11 +289,13 @@ def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_p
     run(*on_hill, tmp_path / "out.npz")
     output = capsys.readouterr()
     assert re.search(r"^root: on the ground below it, 0 to \d+ cm above its", output.out, re.M)
-    assert re.search(r"^standing feet in the ground +[01]\.\d % ", output.out, re.MULTILINE)
+    assert re.search(
+        r"^penetration of standing feet, % of frames +[01]\.\d$", output.out, re.MULTILINE
+    )
     assert "--root ground" not in output.err
     with np.load(tmp_path / "out.npz") as archive:
         placement = json.loads(str(archive["placement"]))
-    assert placement["sunk"] < 0.02 and placement["groundless"] == 0.0
+    assert placement["penetration_stance"] < 0.02 and placement["groundless"] == 0.0
     assert load_clip(tmp_path / "out.npz").positions_ws[..., 1].max() > 2.5
 
 
@@ -307,7 +309,7 @@ def test_apply_says_how_far_it_puts_a_clip_that_follows_its_ground_from_the_capt
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "parameters.toml").write_text('preset = "record"\nlock.enabled = false\n')
     run("apply", tmp_path / "run", tmp_path / "up.npz", *on_hill[2:], out)
-    figures = capsys.readouterr().out.partition("against the captured motion")[2]
+    figures = capsys.readouterr().out.partition("difference from the captured motion")[2]
     solved = load_clip(out)
     apart = solved.positions_ws[:, 0, 1] - captured.positions_ws[:, 0, 1]
     rms = 100.0 * float(np.sqrt(np.mean(apart**2)))  # cm
@@ -322,11 +324,13 @@ def test_run_warns_of_a_root_that_stays_below_a_hill_and_names_frames(on_hill, t
     run(*on_hill, tmp_path / "out.npz", "--root", "animation")
     output = capsys.readouterr()
     assert "\nroot: as animated\n" in output.out
-    warning = output.err.splitlines()[0]
-    assert warning.startswith("jaxik: standing feet are 2 cm or more in the ground in ")
-    assert re.search(r"deepest: 1\d\d\.\d cm, (left|right), frame \d+", warning)
-    assert warning.endswith("likely cause: the root stays on the animation's floor where the "
-                            "ground rises (use --root ground)")  # fmt: skip
+    first, *_, cause = output.err.splitlines()
+    place = r"worst 1\d\d\.\d cm, (left|right), frame \d+"
+    assert re.match(r"jaxik: penetration \d\d\.\d % of frames \(≤ 5\.0\), " + place, first)
+    assert cause == (
+        "jaxik: likely cause of feet off the ground: the root stays on the animation's floor "
+        "where the ground rises (use --root ground)"
+    )
 
 
 def test_run_names_the_other_up_axis(on_hill, tmp_path, capsys):

@@ -487,7 +487,7 @@ def test_a_cause_of_misplaced_feet_is_named_only_where_its_remedy_helps(route, t
             terrain_options=TerrainOptions(**options),
         )  # fmt: skip
         animation = load_animation(files)
-        _, cause = animation.assess(animation.placed_clip)
+        cause = animation.cause(animation.place(animation.placed_clip))
         assert cause is not None
         return cause
 

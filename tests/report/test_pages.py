@@ -16,8 +16,8 @@ from scipy import stats
 from fitting.clips import load_clip
 from fitting.ground import ground_patch
 from fitting.motion import worst_window
-from fitting.motion.accuracy import QUANTITIES, Accuracy
-from fitting.motion.measures import Cause, Extreme, Measures, Placement
+from fitting.motion.accuracy import ACCURACY, QUANTITIES
+from fitting.motion.measures import BOUNDED, MEASURES, Cause, Extreme, Measures
 from fitting.motion.playback import RESIDUAL_KINDS
 from fitting.motion.worst_window import find_worst_window
 from fitting.problem.scene import legs_ws
@@ -43,67 +43,63 @@ from support.playbacks import FRAMES, LEGS, error, playback
 
 
 def test_every_figure_has_a_label_in_the_same_order_and_is_shown_in_its_unit():
-    for figures, columns in ((Accuracy, formatting.ACCURACY), (Measures, formatting.MEASURES)):
-        assert list(columns) == [field.name for field in dataclasses.fields(figures)]
     assert list(formatting.RESIDUALS) == list(RESIDUAL_KINDS)
     assert list(formatting.DIFFERENCES) == list(QUANTITIES)
     factors = {"%": 100, "cm": 100, "mm": 1000, "°": math.degrees(1), "degrees": math.degrees(1)}
-    for table in (
-        formatting.ACCURACY,
-        formatting.MEASURES,
-        formatting.RESIDUALS,
-        formatting.DIFFERENCES,
-    ):
+    for table in (ACCURACY, MEASURES, formatting.RESIDUALS, formatting.DIFFERENCES):
         for column in table.values():
             assert column.factor == factors.get(column.unit.split()[0], 1), column
     for name, value, shown in (
-        ("penetration_mean", 0.01234, "1.23"),
+        ("penetration_depth", 0.01234, "1.23"),
         ("reached", 0.875, "87.5"),
         ("pops", 12.0, "12"),
         ("slide", math.nan, "–"),
     ):
-        assert formatting.MEASURES[name].format(value) == shown
+        assert MEASURES[name].format(value) == shown
 
 
 # How feet are placed on their ground
 
-GOOD = Placement(
-    sunk=0.01,
-    floating=0.02,
-    sunk_swing=0.03,
-    sunk_frames=0.04,
-    groundless=0.05,
-    deepest=Extreme(0.031, 7, "left"),
-    highest=Extreme(0.022, 8, "right"),
-    slide=0.011,
-    largest_slide=Extreme(0.044, 9, "left"),
-    pop=Extreme(0.033, 10, "right"),
-)
 NAN, NOTHING = math.nan, Extreme(math.nan, 0, "left")
-UNKNOWN = Placement(NAN, NAN, NAN, NAN, 1.0, NOTHING, NOTHING, NAN, NOTHING, NOTHING)
+UNKNOWN = Measures(**{**dict.fromkeys(MEASURES, NAN), "groundless": 1.0}, worst={"pop": NOTHING})
+GOOD = dataclasses.replace(
+    UNKNOWN,
+    penetration=0.04,
+    floating=0.02,
+    contact=0.97,
+    groundless=0.05,
+    slide=0.011,
+    pop=0.013,
+    worst={
+        "penetration": Extreme(0.031, 7, "left"),
+        "floating": Extreme(0.022, 8, "right"),
+        "contact": Extreme(0.031, 7, "left"),
+        "slide": Extreme(0.044, 9, "left"),
+        "pop": Extreme(0.013, 10, "right"),
+    },
+)
+BOUNDS = {name: measure.bound for name, measure in BOUNDED.items()}
 
 
 def test_the_table_says_how_often_how_far_and_where_and_what_is_unknown_is_null_in_json():
-    heading, _, *rows = animations.text(GOOD).splitlines()
-    assert heading == "feet and ground, 2 cm or more   frames  largest"
+    heading, *rows = formatting.figures_table("feet on the ground", {"solved": GOOD})
+    assert heading == ["feet on the ground", "solved"]
     assert rows == [
-        "standing feet in the ground     1.0 %   3.1 cm, left, frame 7",
-        "standing feet above the ground  2.0 %   2.2 cm, right, frame 8",
-        "moving feet in the ground       3.0 %",
-        "any foot in the ground          4.0 %",
-        "no ground under the sole        5.0 %",
-        "slide in a stance, median       1.1 cm  4.4 cm, left, frame 9",
-        "pop in 1/60 s                           3.3 cm, right, frame 10",
+        ["penetration, % of frames", "4.0 · 3.1 cm, left, frame 7"],
+        ["floating, % of frames", "2.0 · 2.2 cm, right, frame 8"],
+        ["contact preservation, % of frames", "97.0 · 3.1 cm, left, frame 7"],
+        ["without ground, % of soles", "5.0"],
+        ["slide, cm a stance", "1.10 · 4.4 cm, left, frame 9"],
+        ["pop, cm in 1/60 s", "1.3 · 1.3 cm, right, frame 10"],
     ]
-    assert "nan" not in animations.text(UNKNOWN)
-    numbers = json.loads(json.dumps(animations.numbers(UNKNOWN)))
-    assert numbers["sunk"] is None and numbers["groundless"] == 1.0
-    assert numbers["deepest"] == {"value": None, "frame": 0, "leg": "left"}
-    assert animations.numbers(GOOD)["pop"]["value"] == pytest.approx(0.033)
+    numbers = json.loads(json.dumps(UNKNOWN.numbers()))
+    assert numbers["contact"] is None and numbers["groundless"] == 1.0
+    assert numbers["worst"]["pop"] == {"value": None, "frame": 0, "leg": "left"}
+    assert GOOD.numbers()["pop"] == pytest.approx(0.013)
 
 
 def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cause():
-    sunk = dataclasses.replace(GOOD, sunk=0.62)
+    off = dataclasses.replace(GOOD, contact=0.36)
     floor = "the root stays on the animation's floor where the ground rises (use --root"
     unit = "the terrain is in another unit of length: one of its units is 0.01 m (--terrain-sc"
     for cause, words in (
@@ -114,23 +110,25 @@ def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cau
         (Cause("missing"), "the terrain does not lie below the whole path"),
         (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
     ):
-        (text,) = animations.warning_texts(sunk, cause)
-        assert "in the ground in 62.0 % of their frames (deepest: 3.1 cm, left, frame 7)" in text
-        assert "above it in 2.0 % (highest: 2.2 cm, right, frame 8)" in text
-        assert f"likely cause: {words}" in text
-    assert animations.warning_texts(GOOD, None) == []
-    (text,) = animations.warning_texts(UNKNOWN, Cause("missing"))
-    assert text.startswith("there is no ground under 100.0 % of the soles; likely cause: ")
-    unlabelled = dataclasses.replace(GOOD, sunk=NAN, floating=NAN, slide=NAN)
-    (text,) = animations.warning_texts(unlabelled, None)
+        text, why = animations.warning_texts(off, BOUNDS, cause)
+        assert text == (
+            "contact preservation 36.0 % of frames (≥ 95.0), worst 3.1 cm, left, frame 7"
+        )
+        assert why.startswith(f"likely cause of feet off the ground: {words}")
+    assert animations.warning_texts(GOOD, BOUNDS, None) == []
+    (text,) = animations.warning_texts(UNKNOWN, BOUNDS, Cause("missing"))
+    assert text.endswith("the terrain does not lie below the whole path")
+    unlabelled = dataclasses.replace(GOOD, contact=NAN, floating=NAN, slide=NAN)
+    (text,) = animations.warning_texts(unlabelled, BOUNDS, None)
     assert text.startswith("no foot of the animation ever stands; see ")
-    bad = dataclasses.replace(GOOD, slide=0.05, pop=Extreme(0.124, 3, "left"))
-    assert animations.warning_texts(bad, None) == [
-        "standing feet slide by 5.0 cm a stance more than animated (most: 4.4 cm, left, frame 9)",
-        "feet pop in 1/60 s (most: 12.4 cm, left, frame 3)",
+    worst = {**GOOD.worst, "pop": Extreme(0.124, 3, "left")}
+    bad = dataclasses.replace(GOOD, slide=0.05, pop=0.124, worst=worst)
+    assert animations.warning_texts(bad, BOUNDS, None) == [
+        "pop 12.4 cm in 1/60 s (≤ 2.0), worst 12.4 cm, left, frame 3",
+        "slide 5.00 cm a stance (≤ 2.00), worst 4.4 cm, left, frame 9",
     ]
-    with pytest.warns(animations.PlacementWarning, match="^mec: feet pop in 1/60 s"):
-        animations.warn(dataclasses.replace(bad, slide=0.0), None, "mec")
+    with pytest.warns(animations.PlacementWarning, match=r"^mec: pop 12.4 cm in 1/60 s"):
+        animations.warn(dataclasses.replace(bad, slide=0.0), BOUNDS, None, "mec")
 
 
 # The worst two seconds
@@ -344,8 +342,8 @@ def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, 
     assert motions.animated.in_ground.any()
     for name, skeleton in zip(("animated", "fitted"), clip["skeletons"][::3], strict=True):
         marks = array(skeleton["inGround"], "u1").reshape(clip["frames"], -1)
-        placement = getattr(motions, name).placement
-        assert marks.any(axis=1).mean() == pytest.approx(placement.sunk_frames)
+        measured = getattr(motions, name).measures
+        assert marks.any(axis=1).mean() == pytest.approx(measured.penetration)
 
 
 def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
@@ -422,22 +420,17 @@ def compared():
     return comparisons.invented_comparison(comparisons.walk(), title=f"walk {HOSTILE}")
 
 
-@pytest.fixture(scope="module")
-def compared_motions(compared):
-    return comparison.of_comparison(compared)
-
-
 def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
-    compared, compared_motions, tmp_path, undrawn
+    compared, tmp_path, undrawn
 ):
     comparison_report.document(compared).write(tmp_path)
     page = Page(tmp_path / pages.PAGE)
     assert page.text.startswith(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
-        "1 of 2 beyond a limit ◐ Worst is deep: its standing feet are 2 cm or more off the "
-        "ground in 100.0 % of their frames"
+        "1 of 2 beyond a bound ◐ Worst is deep: "
     )
-    assert "close places standing feet best" in page.text
+    assert "penetration 100.0 % of frames (≤ 5.0), worst 11" in page.text
+    assert "close keeps standing feet on the ground best" in page.text
     assert (
         f"Closest to the captured motion is close, whose ankles are 0.0 cm away (rms), furthest "
         f"is deep with {100 * DEEP:.1f} cm; without foot IK" in page.text
@@ -452,11 +445,11 @@ def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
     loads = {load for load in page.loads if not load.startswith("data:")}
     assert loads == {"compare.md", "compare.json", "compare.png"}
     assert {"h2 Limits of the data", "h2 What was asked"} <= set(page.headings)
-    assert compared_motions.accuracy["deep"].ankle == pytest.approx(DEEP)
+    assert compared.accuracy["deep"].ankle == pytest.approx(DEEP)
 
 
 def test_where_feet_are_furthest_off_is_the_worst_window(compared):
-    feet, _ = compared.animation.place(compared.clips["close"])
+    feet = compared.motions["close"].soles
     gap = np.zeros((400, 2))
     gap[150:160, 0] = -0.3
     gap[30:60, 1] = 9.0  # a moving foot, which may be above the ground
@@ -468,22 +461,22 @@ def test_where_feet_are_furthest_off_is_the_worst_window(compared):
     assert comparison.worst_seconds(feet, 600.0) == (0, 399)
 
 
-def test_the_worst_fault_is_named_and_no_system_praised_that_is_worse_than_the_animation(
-    compared, compared_motions
-):
-    placed = compared_motions.motions["close"].placement
-    pop = dataclasses.replace(placed.pop, value=0.0)
-    still = dataclasses.replace(placed, sunk=0.0, floating=0.0, slide=-0.01, pop=pop)
-    popping = dataclasses.replace(still, pop=dataclasses.replace(placed.pop, value=0.1))
-    excess, words = comparison_report.faults(popping)[0]
-    assert excess == pytest.approx(2.0 / placed.size) and words.startswith("its feet pop by up to")
-    assert comparison_report.beyond({"a": still, "b": popping}) == ["b"]
-    unknown = dataclasses.replace(still, sunk=math.nan, groundless=1.0)
-    assert "no ground under 100.0 %" in comparison_report.faults(unknown)[0].words
-    accuracy = compared_motions.accuracy
-    worse = {**accuracy, "as animated": accuracy["close"]}
-    far = dataclasses.replace(compared_motions, accuracy=worse)
-    last = comparison_report.findings(compared, far)[2]
+def test_the_worst_is_named_and_no_system_praised_that_is_worse_than_the_animation(compared):
+    placed = compared.motions["close"].measures
+    still = dataclasses.replace(placed, penetration=0.0, contact=1.0, slide=-0.01, pop=0.0)
+    popping = dataclasses.replace(still, pop=3.0 * compared.bounds["pop"])
+    (first, *others) = popping.against(compared.bounds)
+    assert first.excess == pytest.approx(3.0) and first.words.startswith("pop ")
+    assert not any(other.is_beyond for other in others)
+    motions = {
+        name: dataclasses.replace(compared.motions["close"], measures=measures)
+        for name, measures in (("close", still), ("deep", popping))
+    }
+    other = dataclasses.replace(compared, motions=compared.motions | motions)
+    assert comparison_report.beyond(other) == ["deep"]
+    captured = {comparison.ANIMATED: compared.motions["close"]}
+    far = dataclasses.replace(compared, motions=compared.motions | captured)
+    last = comparison_report.findings(far)[2]
     assert last.bad and last.text.startswith("No system comes closer to the captured motion")
 
 

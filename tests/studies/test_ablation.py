@@ -19,9 +19,8 @@ from fitting.experiment.file_tables import COMPLETE, Ablation
 from fitting.experiment.problems import ClipData
 from fitting.inference.noise import NoiseOptions
 from fitting.inference.optimise.solution import Solution
-from fitting.motion.accuracy import Accuracy
+from fitting.motion.accuracy import ACCURACY, Accuracy
 from fitting.report import pages
-from fitting.report.formatting import ACCURACY
 from fitting.runtime import activity
 from fitting.studies import ablation
 from fitting.studies.ablation import Row

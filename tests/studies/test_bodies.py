@@ -121,10 +121,9 @@ def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
     for size in (1.0, 0.5, 3.0):
         clip = scaled(walk, size)
         lowered = clip.with_motion(clip.positions_ws - [0.0, 0.03 * size, 0.0], clip.rotations_ws)
-        feet = measures.soles(lowered, clip, FLOOR)
-        assessed = measures.assess(feet, lowered, clip)
-        assert assessed.misplaced and assessed.visible == pytest.approx(0.02 * size, rel=0.02)
-        shares.append(assessed.sunk)
+        measured = measures.place(lowered, clip, clip, FLOOR).measures
+        assert measured.misplaced and measured.visible == pytest.approx(0.02 * size, rel=0.02)
+        shares.append(measured.penetration)
     np.testing.assert_allclose(shares, shares[0])
 
 
@@ -202,8 +201,9 @@ def test_the_root_rises_without_pops_on_a_hill_and_on_stairs(on_a_floor):
 
 def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
     animation = Animation(on_a_floor, terrain_of(hill()), root=AS_ANIMATED)
-    placed, cause = animation.assess(on_a_floor)
-    assert placed.misplaced and placed.sunk > 0.5
+    placed = animation.place(on_a_floor)
+    assert placed.measures.misplaced and placed.measures.penetration > 0.5
+    cause = animation.cause(placed)
     assert cause is not None and cause.kind == "root"
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import json
-import math
 import re
 
 import jax
@@ -12,12 +11,12 @@ import pytest
 from fitting import jobs
 from fitting.cli import main
 from fitting.experiment.systems import preset_names, preset_system
-from fitting.motion.measures import Extreme
+from fitting.motion import measures
+from fitting.motion.measures import BOUNDED
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
-from fitting.studies import suite, suite_report
-from fitting.studies import suite as suite_suite
-from fitting.studies.suite import Cell, Suite, run_suite
+from fitting.studies import comparison_report, suite, suite_report
+from fitting.studies.suite import Suite, run_suite
 from fitting.synthetic import footsteps
 from jaxik.maths import parameter_tree
 
@@ -88,20 +87,13 @@ def test_stairs_have_their_rises_and_rubble_its_height():
 # Bounds
 
 
-def test_a_cell_is_within_its_bound():
-    within = Cell(0.02, 0.02), Cell(0.95, 0.95, is_least=True), Cell(math.nan, 0.02)
-    beyond = Cell(0.021, 0.02), Cell(0.94, 0.95, is_least=True)
-    assert [cell.is_within for cell in (*within, *beyond)] == [True] * 3 + [False] * 2
-
-
 @in_float64
 def test_a_flat_floor_allows_the_bare_bounds():
-    situation = suite.SITUATIONS[0]
-    limits = suite_suite.bounds_of(situation.animation(3.0), is_flat=situation.is_flat)
-    assert limits["slide"] == suite_suite.FLAT_SLIDE
-    assert limits["pop"] == pytest.approx(
-        suite_suite.POP, abs=2e-4
-    )  # the ball rises as the foot rolls
+    animation = suite.SITUATIONS[0].animation(3.0)
+    size = animation.place(animation.placed_clip).measures.size
+    assert animation.bounds["slide"] == pytest.approx(size * measures.FLAT_SLIDE)
+    # The ball rises as the foot rolls.
+    assert animation.bounds["pop"] == pytest.approx(size * measures.VISIBLE, abs=2e-4)
 
 
 @in_float64
@@ -115,7 +107,9 @@ def test_a_curb_allows_as_much_as_a_smooth_swing_onto_it_needs():
         rises += list(np.abs(np.diff(heights[stands])) / np.diff(stands))
     fastest = 1.875 * max(rises) * 60.0
     assert fastest > 0.3
-    assert suite_suite.swing_speed(animation) == pytest.approx(fastest, rel=0.1)
+    assert measures.swing_speed(animation.place(clip).soles, clip.fps) == pytest.approx(
+        fastest, rel=0.1
+    )
 
 
 # What is run and written
@@ -123,50 +117,41 @@ def test_a_curb_allows_as_much_as_a_smooth_swing_onto_it_needs():
 
 def test_a_system_without_effect_is_within_bounds_on_the_flat_and_not_on_stairs(written):
     suite, _ = written
-    flat, stairs = (scene.outcomes["still"].cells for scene in suite.scenes)
-    assert [key for key, cell in flat.items() if not cell.is_within] == []
-    assert not stairs["penetration"].is_within
-    assert stairs["slide"].value == pytest.approx(0.0, abs=1e-9)
+    flat, stairs = suite.scenes
+    assert flat.beyond("still") == []
+    assert "penetration" in [bounded.name for bounded in stairs.beyond("still")]
+    slide = stairs.comparison.motions["still"].measures.slide
+    assert slide == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_numbers_are_those_of_the_cells_and_a_failure_is_beyond_all_bounds(written):
+def test_the_numbers_are_those_of_the_measures_and_a_failure_is_beyond_all_bounds(written):
     suite, folder = written
-    assert all("leg.weight" in scene.failures["failing"] for scene in suite.scenes)
     within, count = suite.counts
-    assert count == 2 * 2 * len(suite_suite.REASONS) and within < count / 2
+    assert count == 2 * 2 * len(BOUNDED) and within < count / 2
     content = json.loads((folder / suite_report.NUMBERS).read_text())
-    assert [scene["name"] for scene in content["situations"]] == list(FEW)
-    assert (content["within"], content["cells"]) == suite.counts
-    for scene, numbers in zip(suite.scenes, content["situations"], strict=True):
-        assert numbers["bounds"] == pytest.approx(dict(scene.bounds))
-        for key, cell in scene.outcomes["still"].cells.items():
-            entry = numbers["systems"]["still"]["cells"][key]
-            assert entry["within"] == cell.is_within
-            assert entry["value"] == (None if math.isnan(cell.value) else cell.value)
-        assert "leg.weight" in numbers["systems"]["failing"]["failure"]
+    assert (content["within"], content["measures"]) == suite.counts
+    for name, scene, numbers in zip(FEW, suite.scenes, content["situations"], strict=True):
+        assert numbers["title"] == name and "leg.weight" in numbers["failures"]["failing"]
+        assert numbers["bounds"] == pytest.approx(scene.comparison.bounds)
+        _, still = numbers["systems"]
+        measured = scene.comparison.motions["still"].measures
+        assert still["name"] == "still" and still["pop"] == measured.pop
+        assert still["beyond"] == [bounded.name for bounded in scene.beyond("still")]
+        assert still["reached"] == (None if np.isnan(measured.reached) else measured.reached)
 
 
 def test_what_is_beyond_its_bound_has_a_mark_and_is_red_in_the_page_and_the_table(written):
     suite, folder = written
     table = suite_report.table(suite)
     stairs = next(row for row in table if row[1] == "still" and row is not table[2])
-    assert stairs[2].endswith(suite_report.MISS)
+    assert stairs[2].endswith(comparison_report.MISS)
     text = (folder / suite_report.TABLE).read_text()
     assert f'<span style="color:red">**{stairs[2]}**</span>' in text
-    assert all(reason in text for reason in suite_suite.REASONS.values())
-    assert "stairs up, still: in the ground" in text and "no motion: " in text
+    assert all(measure.reason in text for measure in BOUNDED.values())
+    assert "stairs up, still: penetration" in text and "no motion: " in text
     assert (folder / suite_report.PAGE).read_bytes().startswith(b"\x89PNG")
     low, high = suite_report.page(suite).axes[0].get_ylim()
     assert -0.3 < low < -0.2 and 1.0 < high < 1.2  # from below the soles to above the pelvis
-
-
-def test_misses_say_where_and_how_far():
-    extreme = Extreme(0.123, 45, "left")
-    text = suite_report._miss("pop", Cell(0.08, 0.02, extreme), "unknown")
-    assert text == "pop 8.0 cm in 1/60 s (≤ 2.0), worst 12.3 cm, left, frame 45"
-    assert suite_report._miss("reach", Cell(0.5, 0.95, is_least=True), "") == (
-        "reached 50.0 % (≥ 95.0)"
-    )
 
 
 @in_float64
@@ -197,7 +182,7 @@ def test_the_command_prints_the_table_whatever_is_in_it(monkeypatch, still, tmp_
     assert main.main(words) == 0
     printed = capsys.readouterr()
     assert re.search(r"^\d+ of 6 within bounds\.$", printed.out, re.MULTILINE)
-    assert suite_report.MISS in printed.out and "\x1b" not in printed.out
+    assert comparison_report.MISS in printed.out and "\x1b" not in printed.out
 
 
 def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
@@ -205,7 +190,7 @@ def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
 
     def run(systems_of, plan, *_, **__):
         names.extend(systems_of(suite.walk(BRIEF).rig))
-        return Suite(plan, ())
+        return Suite(plan, (), ())
 
     monkeypatch.setattr(jobs, "run_suite", run)
     assert main.main(["compare", "--suite"]) == 0
@@ -214,17 +199,14 @@ def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
 
 # How good the defaults are
 
-KNOWN_MISSES = {  # by system and situation; cells that are close to their bound among them
+KNOWN_MISSES = {  # by system and situation; some of them are close to their bound
     "record": {
-        "hill": "penetration slide pop jerk reach",
-        "stairs up": "penetration float pop jerk reach",
-        "slope across": "pop",
+        "hill": "penetration contact slide pop pelvis_jerk reached",
+        "stairs up": "penetration contact pop pelvis_jerk reached",
     },
     "stride": {
-        "hill": "penetration pop jerk",
-        "stairs up": "penetration pop jerk",
-        "slope across": "pop",
-        "rubble": "pop",
+        "hill": "penetration pop pelvis_jerk",
+        "stairs up": "penetration pop pelvis_jerk",
     },
 }
 
@@ -239,9 +221,9 @@ def test_what_is_within_its_bounds_stays_so(chosen):
         return {name: preset_system(name, rig) for name in KNOWN_MISSES}
 
     assert not [
-        (name, scene.situation.name, key, cell)
+        (name, scene.situation.name, bounded.words)
         for scene in run_suite(systems_of, chosen).scenes
         for name, known in KNOWN_MISSES.items()
-        for key, cell in scene.outcomes[name].cells.items()
-        if not cell.is_within and key not in known.get(scene.situation.name, "").split()
+        for bounded in scene.beyond(name)
+        if bounded.name not in known.get(scene.situation.name, "").split()
     ]

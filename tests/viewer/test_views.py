@@ -14,7 +14,7 @@ from fitting.clips import save_clip
 from fitting.experiment import parameter_files
 from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress, Report
-from fitting.motion.measures import SLIDE_LIMIT, VISIBLE, Soles
+from fitting.motion.measures import VISIBLE, Soles
 from fitting.problem.space import free_parameter
 from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.fit.fit_jobs import Loaded
@@ -219,7 +219,7 @@ def test_any_parameter_moves_the_feet_and_the_cost_and_poses_are_finite_or_refus
 
 
 def test_deep_feet_are_red_and_sliding_ones_purple_counted_from_the_beginning_of_a_stance(solver):
-    sight = Sight(np.array([[0.0, VISIBLE, 0.0]]), np.array([[0.0, 0.0, SLIDE_LIMIT]]))
+    sight = Sight(np.array([[0.0, VISIBLE, 0.0]]), np.array([[0.0, 0.0, VISIBLE]]))
     plain, deep, slid = sight.colours((10, 20, 30))[0].tolist()
     assert plain == [10, 20, 30] and deep == list(IN_GROUND) and slid[0] > 200 < slid[2]
     clip = solver.take.animated
@@ -228,7 +228,7 @@ def test_deep_feet_are_red_and_sliding_ones_purple_counted_from_the_beginning_of
     drift = np.arange(clip.frame_count)[:, None, None] * np.array([0.01, 0.0, 0.0])
     still = dataclasses.replace(clip, positions_ws=np.repeat(clip.positions_ws[:1], 7, axis=0))
     moved = dataclasses.replace(still, positions_ws=still.positions_ws + drift)
-    soles = Soles(np.full((7, 2, 2), -0.03), np.zeros((7, 2, 2)), stance)
+    soles = Soles(np.zeros((7, 2, 2, 3)), np.full((7, 2, 2), -0.03), np.zeros((7, 2, 2)), stance)
     sight = seen(soles, moved, still)
     np.testing.assert_allclose(sight.slide[:, 0], [0, 0, 0.01, 0.02, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(sight.depth, 0.03)

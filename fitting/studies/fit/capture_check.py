@@ -240,7 +240,7 @@ def find(clips: Sequence[ClipData], playbacks: Sequence[Playback]) -> list[Captu
 def _of_ground(clip: ClipData) -> GroundOffset:
     captured = with_soles_of(clip.reference, clip.base)
     feet = measures.soles(captured, clip.base, clip.terrain)
-    places = measures.sole_points(captured).mean(axis=2)[..., [0, 2]]
+    places = feet.points_ws.mean(axis=2)[..., [0, 2]]
     return measure_ground(feet.gap, places, clip.reference.stance_labels())
 
 

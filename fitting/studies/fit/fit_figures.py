@@ -1,20 +1,14 @@
-"""Interval plots of a fit's parameters, and tables of its motions."""
+"""Interval plots of a fit's parameters, and a table of what limits do."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 
-from fitting.motion.accuracy import Accuracy
-from fitting.motion.measures import Placement
 from fitting.motion.playback import ClipActivity
 from fitting.report.document import ParameterRow
-from fitting.report.formatting import ACCURACY, Table, headings, interval, number, percent
-from fitting.studies import animations
+from fitting.report.formatting import Table, interval, number, percent
 
 from .fit import FittedParameter
 from .fit_tables import Truth, verdict
-
-NO_CORRECTION = ("bone_length",)  # figures that say nothing of how close two motions are
 
 
 def parameter_rows(
@@ -77,24 +71,3 @@ def limit_table(clips: Sequence[ClipActivity]) -> tuple[Table, list[str]]:
     active = [name for name in clips[0].limits if name not in idle]
     rows = [[name, *(percent(clip.limits[name]) for clip in clips)] for name in active]
     return [["limit", *names], *rows], idle
-
-
-def accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
-    """How far motions are from the captured one; a column for each, by name."""
-    table = [["difference from the captured motion", *accuracies]]
-    values = zip(*map(astuple, accuracies.values()), strict=True)
-    rows = zip(ACCURACY.items(), headings(ACCURACY), values, strict=True)
-    for (key, column), heading, row in rows:
-        if key not in NO_CORRECTION:
-            table.append([heading, *map(column.format, row)])
-    return table
-
-
-def placement_table(placements: Mapping[str, Placement]) -> Table:
-    """How the feet of motions are placed on the ground; a column for each, by name."""
-    tables = [animations.table(placement) for placement in placements.values()]
-    table = [[tables[0][0][0], *placements]]
-    for rows in zip(*(table[1:] for table in tables), strict=True):
-        cells = [" · ".join(filter(None, (share, place))) for _, share, place in rows]
-        table.append([rows[0][0], *cells])
-    return table

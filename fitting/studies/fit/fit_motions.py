@@ -22,7 +22,7 @@ from fitting.clips.clip_frames import clip_from_result, raised
 from fitting.experiment.problems import ClipData
 from fitting.ground import ground_patch
 from fitting.ground.ground_patch import GroundPatch
-from fitting.motion import accuracy, measures, playback
+from fitting.motion import accuracy, playback
 from fitting.motion.accuracy import Accuracy, Errors
 from fitting.motion.measures import PlacedMotion, place, with_soles_of
 from fitting.problem.capture_system import system_and_scenes
@@ -74,7 +74,7 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     captured = with_soles_of(data.reference, data.base)
     solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}
     placed = {
-        name: _placed(clip, animated, data)
+        name: place(clip, animated, data.base, data.terrain)
         for name, clip in {"animated": animated, **solved, "captured": captured}.items()
     }
     return ClipMotions(
@@ -86,11 +86,6 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
             for name, clip in solved.items()
         },
     )
-
-
-def _placed(clip: Clip, animated: Clip, data: ClipData) -> PlacedMotion:
-    feet = measures.soles(clip, data.base, data.terrain)
-    return place(clip, feet, measures.assess(feet, clip, animated))
 
 
 def summarised(motions: Sequence[ClipMotions]) -> dict[str, Accuracy]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.clips import flight
 from fitting.motion import playback, worst_window
-from fitting.motion.measures import Placement
+from fitting.motion.measures import Measures
 from fitting.motion.playback import ClipActivity, Nudge, Playback
 from fitting.motion.worst_window import WorstWindow
 from fitting.report import document, motion_data, pages, style
@@ -30,7 +30,7 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import Table
+from fitting.report.formatting import Table, figures_table
 from fitting.report.motion_data import ShownClip, ShownMotion
 from fitting.runtime import activity
 from fitting.runtime.beside import calls_beside
@@ -163,7 +163,7 @@ def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     return View(
         [shown(*each) for each in zip(motions, labels, windows, strict=True)],
         [entry.reference.name for entry in fitted.experiment.clips],
-        f"{100 * motions[0].fitted.placement.visible:.2g} cm",
+        f"{100 * motions[0].fitted.measures.visible:.2g} cm",
         stands="captured",
         watched="fitted motion",
     )
@@ -295,16 +295,16 @@ def _distances(fitted: Fit, motions: Sequence[ClipMotions]) -> Section:
     ]
     if motions:
         accuracies = fit_motions.summarised(motions)
-        table = fit_figures.accuracy_table(accuracies)
+        table = figures_table("difference from the captured motion", accuracies)
         blocks.append(Grid(table, "Accuracy before and after the fit"))
         for entry, clip in zip(fitted.experiment.clips, motions, strict=True):
             name = f": {entry.reference.name}" if len(motions) > 1 else ""
-            table = fit_figures.placement_table(_placements(clip))
+            table = figures_table("feet on the ground", _measures(clip))
             blocks += [Heading(f"Feet on the ground{name}"), Grid(table, "How feet are placed")]
         blocks.append(
             Text(
-                "Distances and angles are root mean squares. A slide or a pop counts by how far it "
-                "exceeds that of the flat animation; frames count from 0."
+                "Distances and angles are root mean squares. After the dot: where a measure is "
+                "worst; frames count from 0."
             )
         )
     return Section("Before and after", blocks)
@@ -364,10 +364,10 @@ def _limits(fitted: Fit, activities: Sequence[ClipActivity]) -> Section:
     return Section("Limits of the data", [*blocks, Points(_remarks(fitted))])
 
 
-def _placements(clip: ClipMotions) -> dict[str, Placement]:
+def _measures(clip: ClipMotions) -> dict[str, Measures]:
     motions = {"flat animation": clip.animated, "before": clip.before}
     motions |= {"fitted": clip.fitted, "captured": clip.captured}
-    return {name: motion.placement for name, motion in motions.items()}
+    return {name: motion.measures for name, motion in motions.items()}
 
 
 def _asked(fitted: Fit) -> Table:

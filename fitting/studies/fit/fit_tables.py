@@ -1,12 +1,10 @@
-"""Tables of a fit: its parameters, how well the clips determine them, and its accuracy."""
+"""Tables of a fit: its parameters, and how well the clips determine them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 from typing import TypeAlias
 
-from fitting.motion.accuracy import Accuracy
 from fitting.motion.playback import ClipActivity, Nudge
-from fitting.report.formatting import ACCURACY, Table, headings, interval, number, percent
+from fitting.report.formatting import Table, interval, number, percent
 
 from .fit import FittedParameter
 
@@ -102,13 +100,3 @@ def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
             cells += [percent(nudge.flipped, 2), f"{nudge.rise:+.1f}"]
         table.append(cells)
     return table
-
-
-def accuracy_table(accuracy: Accuracy) -> Table:
-    """How far a solved motion is from the captured one, a row for each figure."""
-    columns = ACCURACY.values()
-    cells = [column.format(value) for column, value in zip(columns, astuple(accuracy), strict=True)]
-    return [
-        ["against the captured motion", ""],
-        *map(list, zip(headings(ACCURACY), cells, strict=True)),
-    ]

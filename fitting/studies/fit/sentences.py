@@ -69,15 +69,15 @@ def _determined(fitted: Fit) -> str:
 
 def _feet(motions: Sequence[ClipMotions]) -> str:
     before, after, captured = (
-        [getattr(clip, name).placement for clip in motions]
+        [getattr(clip, name).measures for clip in motions]
         for name in ("before", "fitted", "captured")
     )
     shares = [
-        max((p.sunk for p in placements), key=_known) for placements in (before, after, captured)
+        max((m.penetration_stance for m in each), key=_known) for each in (before, after, captured)
     ]
     if math.isnan(shares[1]):
         return "No standing foot has ground under it, so nothing can be said of feet in the ground."
-    visible = f"{100 * motions[0].fitted.placement.visible:.2g} cm"
+    visible = f"{100 * motions[0].fitted.measures.visible:.2g} cm"
     where = " of the worst clip" if len(motions) > 1 else ""
     text = (
         f"Standing feet are {visible} or more in the ground in {percent(shares[1])} of their "
