@@ -370,7 +370,7 @@ def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
 
 
 def test_an_interrupt_before_the_search_writes_nothing(done, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(fit_jobs, "load_clips", interrupt)
+    monkeypatch.setattr(fit_jobs, "load", interrupt)
     words = ["fit", str(done.experiment), "-o", str(tmp_path / "run")]
     assert main.main(words) == main.INTERRUPTED
     assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)

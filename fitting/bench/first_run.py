@@ -89,7 +89,7 @@ class _Clock(activity.Watcher):
         self.times: list[float] = []
 
     def reported(self, result: object) -> None:
-        if not isinstance(result, tuple):  # `Loaded`, before the search
+        if not isinstance(result, tuple):  # the experiment, before the search
             self.times.append(time.time())
 
 

@@ -27,6 +27,7 @@ from fitting.motion.flat_animation import (
     with_cut_off_swings,
     with_remark_if_uneven,
 )
+from fitting.problem.capture_system import alone
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
@@ -57,14 +58,32 @@ class ClipData(NamedTuple):
     """Parameters that change along the base, (frames, ...) by dotted name."""
 
 
+class LoadedExperiment(NamedTuple):
+    """An experiment with all that its files hold."""
+
+    experiment: Experiment
+    clips: tuple[ClipData, ...]
+    problem: Problem[jaxik.FootIK]
+    known_values: Mapping[str, float] | None
+    """What made a synthetic reference, by dotted name."""
+
+
 @in_float64
-def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
-    """Loads the clips of an experiment and builds its problem.
+def load(experiment: Experiment) -> LoadedExperiment:
+    """Loads the clips of an experiment, builds its problem, and reads which values are known.
 
     Raises:
         ValueError: something in the experiment does not fit its clips or its preset.
     """
-    return problem_from_clips(experiment, load_clips(experiment))
+    clips = load_clips(experiment)
+    problem = problem_from_clips(experiment, clips)
+    known_values = load_known_values(experiment, alone(problem.space.system))
+    return LoadedExperiment(experiment, clips, problem, known_values)
+
+
+def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
+    """The problem of an experiment; as `load`."""
+    return load(experiment).problem
 
 
 @in_float64
@@ -295,11 +314,17 @@ def _into(space: Transform, joint: Transform) -> Transform:
     return space.inverse() @ joint
 
 
-def load_known_values(experiment: Experiment) -> Mapping[str, float] | None:
+def load_known_values(
+    experiment: Experiment, ik: jaxik.FootIK | None = None
+) -> Mapping[str, float] | None:
     """Known parameters by dotted name, from the first clip that names a truth file.
 
     Tables in the file that belong to no stage are ignored, and so are switches. A leaf with several
     values has each of them under its name with `[index]`, and their mean under its own name.
+
+    Args:
+        experiment: whose clips may name a truth file.
+        ik: its system; None makes it.
 
     Returns:
         The values; None if no clip names a truth file.
@@ -310,7 +335,7 @@ def load_known_values(experiment: Experiment) -> Mapping[str, float] | None:
     path = next((clip.truth for clip in experiment.clips if clip.truth is not None), None)
     if path is None:
         return None
-    ik = experiment.preset_system()
+    ik = experiment.preset_system() if ik is None else ik
     content = read_toml(path, "a truth")
     leaves = flatten({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
     with_parameters(ik, leaves, str(path))

@@ -11,11 +11,11 @@ from typing import Any
 
 import jaxik
 from fitting import viewer
+from fitting.experiment.problems import LoadedExperiment
 from fitting.inference.optimise.solution import Report
 from fitting.problem.capture_system import alone
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
-from fitting.studies.fit.fit_jobs import Loaded
 
 EXTRA = 'needs viser: pip install "jaxik[view]"'
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -130,7 +130,7 @@ class FitWatch(activity.Watcher):
 
     def reported(self, result: object) -> None:
         """Opens the page once the clips are loaded; then shows the best point, now and then."""
-        if isinstance(result, Loaded):
+        if isinstance(result, LoadedExperiment):
             self._problem = result.problem
             page = opened(viewer.subject_of_fit(*result), self.folder, self.address)
             self.viewer = self._page.enter_context(page)

@@ -12,12 +12,12 @@ import pytest
 from fitting import viewer
 from fitting.clips import save_clip
 from fitting.experiment import parameter_files
+from fitting.experiment.problems import LoadedExperiment
 from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress, Report
 from fitting.motion.measures import VISIBLE, Soles
 from fitting.problem.space import free_parameter
 from fitting.studies.animations import AnimationFiles, load_animation
-from fitting.studies.fit.fit_jobs import Loaded
 from fitting.studies.fit.fit_motions import saved_clips
 from fitting.viewer import Solver, solving, tuning, views
 from fitting.viewer.page import Latest
@@ -259,7 +259,7 @@ def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
     lines: list[str] = []
     with listening(lines.append), FitWatch(tmp_path, Address(port=0)) as watch:
         watch.reported(Progress("start", 0, 0, 9.0, 9.0, 0.0))  # before there is a page
-        watch.reported(Loaded(fitted.experiment, fitted.problem, fitted.clips))
+        watch.reported(LoadedExperiment(fitted.experiment, fitted.clips, fitted.problem, None))
         assert "open http://127.0.0.1:" in lines[0] and watch.viewer.wait(300)
         u = np.array([0.1, 0.2])
         watch.reported(report(5.0, u))

@@ -1,13 +1,15 @@
 """The search of an experiment, and the assessment of its solution, which may meet a lower point."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 import jaxik
 from fitting.experiment.experiment import Experiment
+from fitting.experiment.problems import ClipData
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import counted, fit_with_noise
 from fitting.inference.optimise.search import find_best_fit, refine
@@ -91,6 +93,11 @@ def assess_solution(
     problem: Problem[jaxik.FootIK],
     solution: Solution,
     on_solution: Callable[[Solution], object] = lambda solution: None,
+    *,
+    known_values: Mapping[str, float] | None = None,
+    run: Path | None = None,
+    has_noise: bool = True,
+    clips: tuple[ClipData, ...] = (),
 ) -> Fit:
     """The fit: a solution and how certain it is, or the lower one that its profiles led to.
 
@@ -99,6 +106,10 @@ def assess_solution(
         problem: the problem of the experiment.
         solution: of the problem.
         on_solution: called with each solution before its assessment, which may fail.
+        known_values: as `Fit` has them, like what follows.
+        run: the folder where it is going to be written.
+        has_noise: whether the reference is captured.
+        clips: of the problem.
 
     Raises:
         ValueError: if the Jacobian at a solution is not finite.
@@ -108,18 +119,29 @@ def assess_solution(
         on_solution(solution)
         of_weight = solution.weighted(float(problem.weight))
         identifiability = assess_identifiability(problem, of_weight)
-        found_lower = identifiability.improvement > MIN_IMPROVEMENT
-        fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
-        if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
-            return fit
+        if identifiability.improvement <= MIN_IMPROVEMENT or solution.interrupted:
+            break
+        if len(left) == MAX_RETURNS:
+            break
         first = identifiability.best_u
         lower = _search_lower(problem, experiment, solution, first)
         if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
-            unmoved = dataclasses.replace(solution, interrupted=lower.interrupted)
-            return dataclasses.replace(fit, solution=unmoved)
+            solution = dataclasses.replace(solution, interrupted=lower.interrupted)
+            break
         left.append(solution.cost)
         solution = lower
         problem = weighted(problem, experiment, solution)
+    return Fit(
+        experiment=experiment,
+        problem=problem,
+        solution=solution,
+        identifiability=identifiability,
+        known_values=known_values,
+        run=run,
+        has_noise=has_noise,
+        left=tuple(left),
+        clips=clips,
+    )
 
 
 def _search_lower(

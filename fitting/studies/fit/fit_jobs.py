@@ -1,10 +1,9 @@
 """Jobs that search: a fit, its posterior, and translations between systems."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +11,7 @@ import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
-from fitting.experiment.problems import (
-    ClipData,
-    load_clips,
-    load_known_values,
-    problem_from_clips,
-    remarks,
-)
+from fitting.experiment.problems import ClipData, load, load_known_values, remarks
 from fitting.experiment.record_files import left_out
 from fitting.inference.noise import NoiseModel, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
@@ -45,24 +38,6 @@ from .fit_motions import Rehearsal
 INTERRUPTED = "interrupted; assessing and writing the best point so far"
 
 
-class Loaded(NamedTuple):
-    """What a fit is about; reported before its search."""
-
-    experiment: Experiment
-    problem: Problem[jaxik.FootIK]
-    clips: tuple[ClipData, ...]
-
-
-class Shown(NamedTuple):
-    """What a fit shows and judges: nothing of it decides what is found."""
-
-    clips: tuple[ClipData, ...]
-    known_values: Mapping[str, float] | None = None
-    """What made a synthetic reference."""
-    has_noise: bool = True
-    """False if the reference is the motion of another system."""
-
-
 @in_float64
 def fit(
     experiment: Experiment | str | Path,
@@ -87,18 +62,16 @@ def fit(
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
-    known_values = load_known_values(experiment)
     with output_folder(output) as run:
-        experiment = with_files(experiment, run)
-        clips = load_clips(experiment)
-        problem = problem_from_clips(experiment, clips)
+        loaded = load(with_files(experiment, run))
+        experiment, clips, problem, known = loaded
         what = f"{len(experiment.free) or 'no'} parameters of {experiment.preset}"
         if of_captures := experiment.free_count - len(experiment.free):
             what += f" and {of_captures} of the capture"
         heading = f"fitting {what} to {len(clips)} clip(s)"
         lines = [heading, *remarks(clips), *capture_check.check(clips).lines]
         activity.log("\n".join(lines))
-        activity.report(Loaded(experiment, problem, clips))
+        activity.report(loaded)
         checkpoints = open_checkpoints(run, experiment, problem)
         rehearsal = Rehearsal(problem) if run is not None and report else None
         with checkpoints:
@@ -106,11 +79,16 @@ def fit(
                 problem, solution = search_with_noise(problem, experiment)
             if solution.interrupted:
                 activity.log(INTERRUPTED)
-            shown = Shown(clips, known_values)
             if run is not None and report:
                 style.prepare_saving()
-            fitted = _assess_and_save(run, experiment, problem, solution, shown)
-        opening = _price_of_record(fitted)
+            save = _saving(run, experiment, problem)
+            fitted = assess_solution(
+                experiment, problem, solution, save,
+                known_values=known, run=run, clips=clips,
+            )  # fmt: skip
+            if run is not None:
+                run_folder.save_fit(run, fitted)
+            opening = _price_of_record(fitted)
         if run is not None and report:
             fit_report.write_fit(run, fitted, opening, rehearsal=rehearsal)
         if not fitted.solution.interrupted:
@@ -146,9 +124,8 @@ def sample(
     else:
         run = Path(fitted)
         experiment, summary = run_folder.load_fit(run)
-        parameters, known_values = summary["parameters"], load_known_values(experiment)
-        clips = load_clips(experiment)
-        problem = problem_from_clips(experiment, clips)
+        parameters = summary["parameters"]
+        experiment, clips, problem, known_values = load(experiment)
         if "noise" in summary:
             problem = with_noise(problem, NoiseModel(**summary["noise"]))
     if max_steps is not None:
@@ -210,11 +187,17 @@ def translate(
             solution = search(problem, experiment, start)
             if solution.interrupted:
                 activity.log(INTERRUPTED)
-            shown = Shown(prepared.clips, has_noise=False)
+            known = None
             if run is not None:
                 translation.save_source(run, prepared)
-                shown = shown._replace(known_values=load_known_values(experiment))
-            fitted = _assess_and_save(run, experiment, problem, solution, shown)
+                known = load_known_values(experiment, problem.space.system)
+            save = _saving(run, experiment, problem)
+            fitted = assess_solution(
+                experiment, problem, solution, save,
+                known_values=known, run=run, has_noise=False, clips=prepared.clips,
+            )  # fmt: skip
+            if run is not None:
+                run_folder.save_fit(run, fitted)
         differences = translation.differences(fitted)
         if run is not None:
             translation.write(run, prepared, fitted, differences)
@@ -269,11 +252,12 @@ def _adopt_lower_point(
         at_solution = minus_cost_at(problem, experiment, solution.u)
         if solution.interrupted or at_solution <= posterior.start_minus_cost:
             return sampled
-        fitted = assess_solution(experiment, problem, solution)
+        known = sampled.known_values
+        fitted = assess_solution(
+            experiment, problem, solution, known_values=known, run=run, clips=clips
+        )
     except KeyboardInterrupt:
         return sampled
-    known_values = sampled.known_values
-    fitted = dataclasses.replace(fitted, known_values=known_values, run=run, clips=clips)
     at_solution = minus_cost_at(problem, experiment, fitted.solution.u)
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
@@ -288,24 +272,16 @@ def _adopt_lower_point(
     return sampled
 
 
-def _assess_and_save(
-    run: Path | None,
-    experiment: Experiment,
-    problem: Problem[jaxik.FootIK],
-    solution: Solution,
-    shown: Shown,
-) -> Fit:
-    """The fit; each of its solutions is on disk before the assessment, which may fail."""
+def _saving(
+    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK]
+) -> Callable[[Solution], None]:
+    """Writes each solution before its assessment, which may fail."""
 
     def save(solution: Solution) -> None:
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
 
-    fitted = assess_solution(experiment, problem, solution, save)
-    fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
-    if run is not None:
-        run_folder.save_fit(run, fitted)
-    return fitted
+    return save
 
 
 def open_checkpoints(

@@ -33,6 +33,7 @@ from fitting.experiment import file_tables
 from fitting.experiment.experiment import ClipEntry, Experiment
 from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
 from fitting.experiment.in_memory import with_files
+from fitting.experiment.problems import LoadedExperiment
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, counted, number, percent
@@ -49,7 +50,7 @@ from fitting.runtime.validation import in_one_line
 from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit, Interval
-from fitting.studies.fit.fit_jobs import Loaded, fit
+from fitting.studies.fit.fit_jobs import fit
 from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 
@@ -585,7 +586,7 @@ class _Wait(activity.Watcher):
         self._watch, self._stack = watch, stack
 
     def reported(self, result: object) -> None:
-        if isinstance(result, Loaded):
+        if isinstance(result, LoadedExperiment):
             problem = result.problem
             # A rule of the user's own is never kept, so that nobody need wait.
             with suppress(NotPlainError):
