@@ -36,7 +36,9 @@ PYTHON_FILES = sorted(path for name in FOLDERS for path in (ROOT / name).rglob("
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TOOLS = {"bash", "git", "pip", "pre-commit", "pyright", "pytest", "ruff"}
 # By commands.
-WRITTEN_PAGES = {f"{name}.md" for name in "summary table compare runs suite notes PATH".split()}
+WRITTEN_PAGES = {
+    f"{name}.md" for name in "summary table compare runs suite notes PATH posterior".split()
+}
 EXPERIMENT = ROOT / "data/experiments/uneven_walk.toml"
 TEXTS = {path: path.read_text(encoding="utf-8") for path in [*PAGES, *PYTHON_FILES, *NOTEBOOKS]}
 

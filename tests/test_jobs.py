@@ -78,7 +78,11 @@ SAMPLE_WORK = [
     ("Summing up the chain", (posterior, "_posterior")),
     ("Playing 80 draws of the posterior", (replay._Clip, "add"), PLAY),
     ("Writing the posterior",),
-    ("Drawing the posterior", (posterior_report.posterior_plots, "corner")),
+    (
+        "Drawing the posterior",
+        (posterior_report.posterior_plots, "corner"),
+        (document.Document, "write"),
+    ),
 ]
 LONG = {function for _, *functions in FIT_WORK + SAMPLE_WORK for function in functions}
 

@@ -9,18 +9,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypedDict
 
 from matplotlib.figure import Figure
 
 from fitting.runtime import files
-from fitting.runtime.json_files import write_json
+from fitting.runtime.json_files import JsonFile, write_json
+from fitting.runtime.validation import Content, in_one_line
 
 from . import formatting, motion_data, pages, style
 from .formatting import JoinedText, Table, aligned, bullets, joined
 from .motion_data import ShownClip
 
-START, END = "<!-- posterior -->", "<!-- /posterior -->"  # no text of a user can hold them
+STORED = "report.json"
 
 
 class Text(NamedTuple):
@@ -116,6 +117,7 @@ class Jump(NamedTuple):
 
 
 Block: TypeAlias = Text | Heading | Points | Terms | Grid | Ranges | Plot | Jump
+BLOCKS = {kind.__name__: kind for kind in (Text, Heading, Points, Terms, Grid, Ranges, Plot, Jump)}
 
 
 class Finding(NamedTuple):
@@ -148,6 +150,8 @@ class View:
     """Whose feet are said to stand."""
     watched: str = "watched motion"
     """Whose soles are marked."""
+    packed: Sequence[Content] = ()
+    """Instead of `clips`, what a page holds of them: of a document that was stored."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ class Document:
     """All that a study says."""
 
     file: str
-    """Name of its Markdown file."""
+    """Name of its Markdown file; empty for what has no text and no page in a folder."""
     kind: str
     """What was done, in a few words."""
     title: str
@@ -193,48 +197,100 @@ class Document:
         """All sections, what was asked last."""
         return [*self.sections, Section("What was asked", [Terms(self.asked)])]
 
-    def write(self, folder: Path) -> None:
+    def write(self, folder: Path, *, stored: bool = False) -> None:
         """Draws the plots, and writes the numbers, and the document as Markdown and as a page.
 
-        The folder is made if needed.
+        Args:
+            folder: where to; it is made if needed.
+            stored: whether `load` finds the document there, to be written again with more sections.
         """
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in self.numbers.items():
             write_json(folder / path, content)
         _draw(folder, self.sections)
+        if not self.file:
+            return
         files.write_text(folder / self.file, _whole(self))
         pictures = _pictures(folder, self.sections)
         spent = sum(picture.size for picture in pictures.values())
-        clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
+        clips: Sequence[Content] = ()
+        if self.view is not None:
+            clips = self.view.packed or motion_data.pack(self.view.clips, spent)
         sections = _on_page(self.whole)
         html = pages.render(clips, document=self, sections=sections, pictures=pictures)
         files.write_text(folder / pages.PAGE, html)
+        if stored:
+            STORED_FILE.write(folder / STORED, _stored(self, clips))
 
 
-def add(folder: Path, file: str, title: str, sections: Sequence[Section]) -> None:
-    """Adds sections to a document that is written, in place of those added before.
+class StoredDocument(TypedDict):
+    """A document as JSON holds it; blocks begin with the name of their kind."""
 
-    Args:
-        folder: of the document; without a page in it, none is made.
-        file: name of its Markdown file, which is made if needed.
-        title: of a file that is made.
-        sections: the headings of those added before begin with the same one.
+    document: Content
+    """What is plain."""
+    findings: list[list]
+    sections: list[list]
+    view: Content | None
+
+
+STORED_FILE = JsonFile(StoredDocument, "a report", "delete it to go without", indent=None)
+PLAIN = ("file", "kind", "title", "verdict", "good", "asked", "files", "note")
+
+
+def load(folder: Path) -> Document | None:
+    """The document that is stored in a folder, with its plots as they are drawn there, if any is.
+
+    Raises:
+        ValueError: its file is damaged.
     """
-    page, path = folder / pages.PAGE, folder / file
-    _draw(folder, sections)
-    if page.is_file():
-        text = page.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
-        before, start, rest = text.partition(START)
-        _, end, after = rest.partition(END)
-        if end:
-            pictures = _pictures(folder, sections)
-            shown = pages.fragment("added.html", sections=_on_page(sections), pictures=pictures)
-            files.write_text(page, f"{before}{start}\n{shown}\n{end}{after}")
-    text = f"# {title}\n"
-    if path.is_file():
-        text = path.read_text(encoding="utf-8", errors="replace")
-    before = text.partition(f"\n## {sections[0].heading}\n")[0].rstrip()
-    files.write_text(path, "\n\n".join([before, *markdown(sections)]) + "\n")
+    path = folder / STORED
+    return _restored(STORED_FILE.read(path, _restored)) if path.is_file() else None
+
+
+def _stored(document: Document, clips: Sequence[Content]) -> StoredDocument:
+    view = document.view
+    return {
+        "document": {name: getattr(document, name) for name in PLAIN},
+        "findings": [list(finding) for finding in document.findings],
+        "sections": [
+            [section.heading, list(map(_stored_block, section.blocks)), section.on_page]
+            for section in document.sections
+        ],
+        "view": None if view is None else {**vars(view), "clips": [], "packed": clips},
+    }
+
+
+def _stored_block(block: Block) -> list:
+    kind = type(block).__name__
+    match block:
+        case Plot():
+            return [kind, block.name, block.caption]
+        case Ranges():
+            return [kind, *block._replace(rows=[vars(row) for row in block.rows])]
+        case _:
+            return [kind, *block]
+
+
+def _restored(stored: StoredDocument) -> Document:
+    try:
+        return Document(
+            **stored["document"],
+            findings=[Finding(*finding) for finding in stored["findings"]],
+            sections=[
+                Section(heading, [_block(*block) for block in blocks], on_page)
+                for heading, blocks, on_page in stored["sections"]
+            ],
+            view=None if stored["view"] is None else View(**stored["view"]),
+        )
+    except (TypeError, KeyError) as error:
+        raise ValueError(in_one_line(error)) from None
+
+
+def _block(kind: str, *fields: Any) -> Block:
+    if kind == Ranges.__name__:
+        rows, *others = fields
+        return Ranges([ParameterRow(**row) for row in rows], *others)
+    return BLOCKS[kind](*fields)
 
 
 def _filled(sections: Sequence[Section]) -> list[Section]:

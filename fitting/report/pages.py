@@ -51,8 +51,8 @@ def render(clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
         content: the template's variables.
     """
     scripts = (*SCRIPTS, *VIEWER_SCRIPTS) if clips else SCRIPTS
-    return fragment(
-        "document.html",
+    template = _environment().get_template("document.html")
+    return template.render(
         **content,
         data=as_json({"clips": clips}),
         colours=COLOURS,
@@ -60,11 +60,6 @@ def render(clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
         style=Markup(_assets(STYLES)),
         script=Markup(_assets(scripts)),
     )
-
-
-def fragment(template: str, **content: Any) -> str:
-    """A part of a page as HTML. What is not marked as HTML is escaped."""
-    return _environment().get_template(template).render(**content)
 
 
 def prose(text: str) -> Markup:

@@ -219,7 +219,9 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {*CLIP_PLOTS, "cost", "worst", "profiles"}
     assert set(names) == {f"{plot}.png" for plot in plots}
-    assert {path.name for path in tmp_path.iterdir()} == {*names, run_folder.SUMMARY, pages.PAGE}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *names, run_folder.SUMMARY, pages.PAGE, document.STORED,
+    }  # fmt: skip
     assert len(sizes) == len(plots)
     assert all(1000 < width < 2000 and 400 < height < 2500 for width, height in sizes)
     assert "| contact.planted_height | 0.11 | m |" in text
@@ -350,9 +352,8 @@ def sampled_fit(fitted: Fit, posterior: Posterior, known: Any) -> SampledFit:
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> tuple[str, dict[str, Any]]:
     sampled = sampled_fit(fitted, posterior, fitted.known_values)
     run_folder.save_posterior(run, sampled)
-    posterior_report.write_posterior(run, sampled)
-    numbers = json.loads((run / run_folder.POSTERIOR).read_text())
-    return (run / run_folder.SUMMARY).read_text(), numbers
+    written = run / posterior_report.write_posterior(run, sampled)
+    return written.read_text(), json.loads((run / run_folder.POSTERIOR).read_text())
 
 
 def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitted):
@@ -373,10 +374,11 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitt
 
 
 def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path, undrawn):
-    (tmp_path / run_folder.SUMMARY).write_text("# hill\n\n## Parameters\n\nof the fit\n")
+    fit_report.fit_document(fitted).write(tmp_path, stored=True)
+    of_fit = (tmp_path / run_folder.SUMMARY).read_text().partition("\n## What was asked\n")[0]
     text, _ = write_posterior(tmp_path, fitted, invented_posterior())
     assert write_posterior(tmp_path, fitted, invented_posterior())[0] == text
-    assert text.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
+    assert text.startswith(f"{of_fit}\n## Posterior\n")
     covered = "of 1 of 2 parameters; among those that the fit calls determined, of 1 of 2."
     assert f"contain the true values {covered}" in text
     assert "| pelvis.on_gain | 1/tick |" in text
@@ -386,7 +388,7 @@ def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path, un
 def test_a_posterior_stands_beside_its_prior(fitted, tmp_path, undrawn):
     posterior = invented_posterior()
     text, numbers = write_posterior(tmp_path, replace(fitted, known_values=None), posterior)
-    assert text.startswith("# hill\n\n## Posterior\n") and "true value" not in text
+    assert text.startswith("# hill\n\nThe posterior around a fit: **") and "true val" not in text
     assert (tmp_path / run_folder.INFERENCE_DATA).exists() == inference_data.is_available()
     text, rows = text.split("### Prior and posterior")[1], numbers["parameters"]
     for row, summary in zip(rows, posterior.summary, strict=True):

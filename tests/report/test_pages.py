@@ -310,23 +310,23 @@ def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, mon
     assert asked["Noise, m and rad"] == "ankle 0.02, knee 0.03, pelvis 0.02, contact 0.25"
 
 
-def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
-    page = (run / pages.PAGE).read_text()
-    (tmp_path / pages.PAGE).write_text(page)
-    for count in (1, 2):
-        lines = Points([f"chain {count} <b>"])
-        warning = Text("`jaxik fit` <i>: **run** it")
-        section = Section("Posterior", [warning, lines, Grid([["parameter"], ["x"]], "x")])
-        document.add(tmp_path, "summary.md", "walk", [section])
+def test_a_stored_document_is_written_again_with_more_sections(run, tmp_path):
+    report = document.load(run)
+    assert report is not None and document.load(tmp_path) is None
+    report.write(tmp_path)
+    for name in ("summary.md", pages.PAGE):
+        assert (tmp_path / name).read_text() == (run / name).read_text(), name
+    warning = Text("`jaxik fit` <i>: **run** it")
+    section = Section("Posterior", [warning, Grid([["parameter"], ["x"]], "x")])
+    dataclasses.replace(report, sections=[*report.sections, section]).write(tmp_path)
     sampled = Page(tmp_path / pages.PAGE)
-    assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
     assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
     assert sampled.headings.count("h2 Posterior") == 1
     assert sampled.data == Page(run / pages.PAGE).data
-    (tmp_path / pages.PAGE).write_text("of another kind")
-    document.add(tmp_path, "summary.md", "walk", [Section("Posterior", [Text("none")])])
-    assert (tmp_path / "summary.md").read_text() == "# walk\n\n## Posterior\n\nnone\n"
-    assert (tmp_path / pages.PAGE).read_text() == "of another kind"
+    for damage in ('{"format": 1}', (run / document.STORED).read_text().replace("Text", "Tax")):
+        (tmp_path / document.STORED).write_text(damage)
+        with pytest.raises(ValueError, match=r"report.json: not a report: .*; delete it"):
+            document.load(tmp_path)
 
 
 def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, motions):

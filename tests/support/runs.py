@@ -72,7 +72,7 @@ def write_run(run: Path, fitted: Fit) -> None:
     counts = (scene.rig.names, scene.frames.dt.size, 0.2)
     activity = ClipActivity(*counts, foot, foot, foot, foot, (1, 2), (1, 1), LIMITS)
     before = playback.run(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
-    fit_report.fit_document(fitted, Measured([before], [activity], {})).write(run)
+    fit_report.fit_document(fitted, Measured([before], [activity], {})).write(run, stored=True)
 
 
 def save(run: Path, fitted: Fit) -> None:

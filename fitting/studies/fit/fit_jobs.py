@@ -144,13 +144,14 @@ def sample(
         except KeyboardInterrupt:
             posterior = dataclasses.replace(posterior, interrupted=True)
         sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
+        written = ""
         if run is not None:
-            _save_and_report(run, sampled)
+            written = _save_and_report(run, sampled)
             if sampled.has_lower_point and not posterior.interrupted:
                 sampled = _adopt_lower_point(run, problem, clips, sampled)
                 posterior = sampled.posterior
         activity.log(joined(["", posterior_report.posterior_text(sampled, run)]))
-        log_output(run, run_folder.SUMMARY)
+        log_output(run, written)
         return posterior
 
 
@@ -223,9 +224,10 @@ def _price_of_record(fitted: Fit) -> list[Section]:
     return [record_price.section(experiment, price)]
 
 
-def _save_and_report(run: Path, sampled: SampledFit) -> None:
+def _save_and_report(run: Path, sampled: SampledFit) -> str:
+    """The name of the file to read."""
     run_folder.save_posterior(run, sampled)
-    posterior_report.write_posterior(run, sampled)
+    return posterior_report.write_posterior(run, sampled)
 
 
 def _adopt_lower_point(

@@ -112,7 +112,7 @@ def write_fit(
         details = [*details, Section("Pictures", [*plots, *curves], on_page=False)]
         report = fit_document(fitted, measured, opening, details)
         with activity.announced("Writing the page"):
-            report.write(run)
+            report.write(run, stored=True)
         drawing.enter_context(activity.announced("Finishing the pictures"))
 
 

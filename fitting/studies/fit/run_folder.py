@@ -10,6 +10,7 @@ posterior.nc      the kept draws for ArviZ, if it is installed
 search.json       how far an unfinished fit is
 lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, report.html, *.png to read
+report.json       that report, which is written anew with a posterior
 
 Each file says in which format it is; one that does not is of an earlier release.
 """

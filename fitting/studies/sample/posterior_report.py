@@ -1,7 +1,8 @@
-"""The report of a sampling: text for the terminal, and its section of the run's summary.md."""
+"""The report of a sampling: text for the terminal, and its sections of the run's report."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,17 @@ from fitting.inference.sample.diagnostics import ParameterSummary
 from fitting.inference.sample.modes import MIN_EXCHANGES, Island
 from fitting.inference.sample.posterior import Posterior
 from fitting.problem.space import Space
+from fitting.report import document, pages
 from fitting.report.document import (
     Block,
+    Document,
+    Finding,
     Grid,
     Heading,
     Plot,
     Points,
     Section,
     Text,
-    add,
     brief,
 )
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
@@ -30,7 +33,7 @@ from fitting.report.style import AFTER, CAPTURED, legend, styled
 from fitting.runtime import activity
 from fitting.studies.fit import goodness_report
 from fitting.studies.fit.fit_tables import Truth
-from fitting.studies.fit.run_folder import LOWER_POINT, SUMMARY
+from fitting.studies.fit.run_folder import LOWER_POINT
 
 from . import posterior_plots
 from .predictive import SURPRISING, Band, Disagreement, PredictiveCheck, Statistic
@@ -38,6 +41,7 @@ from .prior_report import posterior_prior_blocks
 from .replay import Replay
 from .sample import SampledFit
 
+TEXT = "posterior.md"
 MAX_CLIPS = 4  # that are drawn
 
 SHOWN = 5  # blocks in the table
@@ -49,15 +53,38 @@ def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
     return brief(sections(sampled, run))
 
 
-def write_posterior(run: Path, sampled: SampledFit) -> None:
-    """Writes the plots of a posterior, and its part of summary.md and page in place of older ones.
+def write_posterior(run: Path, sampled: SampledFit) -> str:
+    """Writes the report of a run anew, with its posterior; returns the name of its Markdown file.
+
+    Where the fit has left no report, there is one of the posterior only.
 
     Args:
         run: the folder of the run.
         sampled: the posterior and the fit.
+
+    Raises:
+        ValueError: the report of the fit is damaged.
     """
     with activity.announced("Drawing the posterior"):
-        add(run, SUMMARY, sampled.experiment.name, sections(sampled, run))
+        report = document.load(run) or _alone(sampled)
+        of_both = replace(report, sections=[*report.sections, *sections(sampled, run)])
+        of_both.write(run)
+    return report.file
+
+
+def _alone(sampled: SampledFit) -> Document:
+    """The report of a posterior, still without its sections, where there is none of a fit."""
+    converged = sampled.posterior.converged
+    return Document(
+        file=TEXT,
+        kind="The posterior around a fit",
+        title=sampled.experiment.name,
+        verdict="Converged" if converged else "Not converged",
+        good=converged,
+        findings=[Finding(sampled.posterior.message)],
+        sections=[],
+        asked=pages.rows(sampled.experiment),
+    )
 
 
 def sections(sampled: SampledFit, run: Path | None) -> list[Section]:
