@@ -104,7 +104,7 @@ def terrain(options: argparse.Namespace) -> int:
     """
     from fitting.clips import load_clip
     from fitting.ground.reconstruction import reconstruct
-    from fitting.report.formatting import aligned
+    from fitting.report.document import text
     from fitting.studies import terrain_report
 
     terrain_report.check_output_files(options.output)
@@ -114,10 +114,9 @@ def terrain(options: argparse.Namespace) -> int:
     with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
         ground = reconstruct(clip, kind=kind)
     with activity.announced("Drawing and writing the ground"):
-        terrain_report.write(options.output, ground, clip, options.margin)
-    print(f"{terrain_report.count_stances(ground)}\n")
-    show(aligned(terrain_report.prediction_table(ground)))
-    print(f"\n{terrain_report.describe_surface(ground)}; written to {options.output}")
+        report = terrain_report.write(options.output, ground, clip, options.margin)
+    show(text(report))
+    print(f"\nwritten to {options.output}")
     return 0
 
 

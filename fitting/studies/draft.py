@@ -28,6 +28,7 @@ from fitting.inference.sensitivity import (
 )
 from fitting.motion import goodness, playback
 from fitting.motion.goodness import Distances, describe_setback
+from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
@@ -35,9 +36,9 @@ from jaxik.world import body
 
 from .fit import capture_check
 from .fit.capture_check import CaptureCheck, stances_of
+from .terrain_report import SCATTER
 
 FEW_STANCES = 6  # of a foot
-SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together
 
 
 EXPERIMENT = "experiment.toml"
@@ -228,6 +229,11 @@ class Draft:
     rig: jaxik.Rig
     """Of the first clip."""
 
+    @property
+    def free(self) -> list[str]:
+        """Names of the parameters that the clips should determine."""
+        return [forecast.name for forecast in self.forecasts if forecast.is_free]
+
 
 def check_request(request: DraftRequest) -> None:
     """Checks that counts match, options have a use and the preset exists; loads no clip.
@@ -316,12 +322,13 @@ def draft(
         if not request.record_only or name in PLACES
     }
     check = capture_check.check(data)
+    problem = problem_from_clips(replace(experiment, free=candidates), data)
     with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
-        as_it_comes = playback.play_all(ik, problem_from_clips(experiment, data).data)
+        as_it_comes = playback.play_all(ik, problem.data)
     apart = goodness.measure_distances(as_it_comes, as_it_comes)
     lines: list[str] = []
     if check.flat:
-        moved = _decisive(experiment, data, candidates) if apart.setbacks else []
+        moved = _decisive(ik, problem, candidates) if apart.setbacks else []
         forecasts = [
             Forecast(name, is_free=name in moved, reach=float(name in moved), contraction=0)
             for name in candidates
@@ -329,7 +336,6 @@ def draft(
         if apart.setbacks:
             lines = [HARM.format(request.preset.name, describe_setback(apart.setbacks[0]))]
     else:
-        problem = problem_from_clips(replace(experiment, free=candidates), data)
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
             forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
@@ -351,17 +357,15 @@ def draft(
     )
 
 
-def _decisive(experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable) -> list[str]:
+def _decisive(ik: jaxik.FootIK, problem: Problem[jaxik.FootIK], candidates: FreeTable) -> list[str]:
     """Names of the parameters on which it depends whether a flat capture is left alone."""
-    scenes = problem_from_clips(experiment, data).data
 
     def is_harmless(ik: jaxik.FootIK) -> bool:
-        played = playback.play_all(ik, scenes)
+        played = playback.play_all(ik, problem.data)
         return not goodness.measure_distances(played, played).setbacks
 
-    ik = experiment.starting_system(data[0].base.rig)
     with activity.announced("Looking for what leaves the feet alone"):
-        return leave_alone(ik, candidates, scenes, is_harmless)
+        return leave_alone(ik, candidates, problem.data, is_harmless)
 
 
 def _assumptions(

@@ -10,7 +10,9 @@ import jaxik
 from fitting.experiment.experiment import ClipEntry, Experiment
 from fitting.experiment.schema import experiment_schema
 from fitting.inference.sensitivity import Forecast
-from fitting.report.formatting import aligned, bullets, joined
+from fitting.report import pages
+from fitting.report.document import Block, Document, Finding, Grid, Heading, Section, Text, text
+from fitting.report.formatting import joined
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
@@ -31,6 +33,7 @@ from .output import output_folder
 
 AS_IT_COMES = "{} as it comes, for this body, without any fit:"
 NOTHING_FREE = "free: nothing; a fit writes these parameters and judges them, in seconds"
+MORE_THAN_A_RECORD = "what is fitted has more than the game's record holds; for that: --record-only"
 MARGIN = 2.0  # m of ground around the stances, over which a foot may swing
 
 OPENING = """\
@@ -44,31 +47,31 @@ def write_ground(ground: Ground) -> None:
     terrain_report.write(ground.mesh, ground.terrain, ground.clip, MARGIN)
 
 
-def write(draft: Draft) -> None:
-    """Writes the experiment."""
-    files.write_text(draft.experiment.path, as_toml(draft))
-
-
-def text(draft: Draft) -> str:
+def document(draft: Draft) -> Document:
     """What is assumed of each clip, what would be better, and what is free."""
-    parts = []
-    for entry, assumptions in zip(draft.experiment.clips, draft.assumptions, strict=True):
-        rows = [["assumed", "from the clip", "what to check or improve"]]
-        rows += [[topic, said, advice] for topic, said, advice in assumptions]
-        parts += [entry.reference.name, aligned(rows), ""]
-    parts += [bullets(list(draft.check.lines)), ""] if draft.check.lines else []
-    parts += [AS_IT_COMES.format(draft.experiment.preset)]
-    parts += [aligned(goodness_report.distances_of_preset(draft.distances)), ""]
-    free = [forecast.name for forecast in draft.forecasts if forecast.is_free]
-    if free:
-        parts.append(f"free: {len(free)} of {len(draft.forecasts)} parameters: {', '.join(free)}")
-    else:
-        parts.append(NOTHING_FREE)
-    if draft.experiment.preset == "record" and not draft.experiment.record_only:
-        parts.append(
-            "what is fitted has more than the game's record holds; for that: --record-only"
-        )
-    return joined(parts)
+    experiment, free, count = draft.experiment, draft.free, len(draft.forecasts)
+    named = f"free: {len(free)} of {count} parameters: {', '.join(free)}" if free else NOTHING_FREE
+    findings = [*(Finding(line, bad=True) for line in draft.check.lines), Finding(named)]
+    if experiment.preset == "record" and not experiment.record_only:
+        findings.append(Finding(MORE_THAN_A_RECORD))
+    assumed: list[Block] = []
+    for entry, assumptions in zip(experiment.clips, draft.assumptions, strict=True):
+        table = [["assumed", "from the clip", "what to check or improve"], *map(list, assumptions)]
+        assumed += [Heading(entry.reference.name, brief=True), Grid(table, "What is assumed")]
+    as_it_comes: list[Block] = [
+        Text(AS_IT_COMES.format(experiment.preset), brief=True),
+        Grid(goodness_report.distances_of_preset(draft.distances), "Distances from the capture"),
+    ]
+    return Document(
+        file="",
+        kind="A first experiment",
+        title=experiment.name,
+        verdict="Ready to fit" if free else "Nothing is free",
+        good=bool(free),
+        findings=findings,
+        sections=[Section("The clips", assumed), Section("As it comes", as_it_comes)],
+        asked=pages.rows(experiment),
+    )
 
 
 def as_toml(draft: Draft) -> str:
@@ -242,8 +245,8 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
             for mesh in meshes:
                 terrain_report.remove(mesh)
             raise
-        write(drafted)
         path = drafted.experiment.path
-        ending = f"written to {path}; now: jaxik fit {path} -o RUN"
-        activity.log(joined(["", text(drafted), "", ending]))
+        files.write_text(path, as_toml(drafted))
+        activity.log(joined(["", text(document(drafted))]))
+        activity.log(f"written to {path}; now: jaxik fit {path} -o RUN")
         return drafted.experiment

@@ -1,6 +1,5 @@
 """The files of a terrain reconstructed from motion (mesh, numbers, picture), and its text."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from fitting.ground.reconstruction import (
     ThinPlate,
 )
 from fitting.report import style
+from fitting.report.document import Document, Finding, Grid, Plot, Section, Text
 from fitting.report.formatting import Table, interval
 from fitting.report.style import BEFORE, GROUND, STAGES, legend, styled
 from fitting.runtime import files
@@ -32,6 +32,7 @@ from fitting.runtime import files
 NUMBERS, FIGURE = ".json", ".png"  # beside the mesh, under its name
 
 COLOURS: dict[str, str] = dict(zip(SURFACE_KINDS, (STAGES[1], STAGES[2], STAGES[0]), strict=True))
+SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together
 PIXELS = 300  # along the longer side of the plan
 LEGS = "o^sDvP*X"  # marks of the legs
 
@@ -60,7 +61,7 @@ def remove(mesh: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write(mesh: Path, terrain: Reconstruction, clip: Clip, margin: float) -> None:
+def write(mesh: Path, terrain: Reconstruction, clip: Clip, margin: float) -> Document:
     """Writes the chosen surface as a mesh, and beside it the numbers and a picture.
 
     Args:
@@ -69,13 +70,44 @@ def write(mesh: Path, terrain: Reconstruction, clip: Clip, margin: float) -> Non
         clip: from which it was.
         margin: how far the mesh extends beyond the stances, m.
     """
-    vertices, faces = terrain.surface.mesh(*terrain.extent(margin))
-    title = f"Ground of {clip.source}: {describe_surface(terrain)}"
-    figure = plan(terrain, margin, clip.rig.names, title)
-    style.save(mesh.with_suffix(FIGURE), figure)
-    text = json.dumps(numbers(terrain, clip), indent=2) + "\n"
-    files.write_text(mesh.with_suffix(NUMBERS), text)
-    files.write(mesh, lambda temporary: meshes.save_mesh(temporary, vertices, faces))
+    report = document(mesh, terrain, clip)
+    figure = plan(terrain, margin, clip.rig.names, title_of(terrain, clip))
+    style.save(mesh.with_suffix(FIGURE), figure)  # first, as it takes longest and may fail
+    report.write(mesh.parent)
+    surface = terrain.surface.mesh(*terrain.extent(margin))
+    files.write(mesh, lambda temporary: meshes.save_mesh(temporary, *surface))
+    return report
+
+
+def title_of(terrain: Reconstruction, clip: Clip) -> str:
+    """Of the picture."""
+    return f"Ground of {clip.source}: {describe_surface(terrain)}"
+
+
+def document(mesh: Path, terrain: Reconstruction, clip: Clip) -> Document:
+    """What a reconstruction says, with its picture, which is drawn; arguments as for `write`."""
+    surface = describe_surface(terrain)
+    error = terrain.predictions[terrain.chosen].rms
+    return Document(
+        file="",
+        kind="Ground reconstructed from motion",
+        title=clip.source,
+        verdict=terrain.chosen.capitalize(),
+        good=error < SCATTER,
+        findings=[Finding(f"{surface[0].upper()}{surface[1:]}.")],
+        sections=[
+            Section(
+                "How well stances are predicted",
+                [
+                    Text(count_stances(terrain), brief=True),
+                    Grid(prediction_table(terrain), "Errors of prediction"),
+                    Plot(mesh.with_suffix(FIGURE).name, title_of(terrain, clip)),
+                ],
+            )
+        ],
+        asked=[["Clip", clip.source]],
+        numbers={mesh.with_suffix(NUMBERS).name: numbers(terrain, clip)},
+    )
 
 
 def prediction_table(terrain: Reconstruction) -> Table:
