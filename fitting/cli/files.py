@@ -66,7 +66,7 @@ def inspect(options: argparse.Namespace) -> int:
         print(drafted)
         return 0
     with activity.announced(f"Reading {options.clip.name}"):
-        clip = load_clip(options.clip, **vars(how))
+        clip = load_clip(options.clip, **how.given)
     described = summary.describe(clip)
     if options.json:
         print(summary.as_json(described))
@@ -109,7 +109,7 @@ def terrain(options: argparse.Namespace) -> int:
 
     terrain_report.check_output_files(options.output)
     with activity.announced(f"Reading {options.clip.name}"):
-        clip = load_clip(options.clip, **vars(clip_options(options)))
+        clip = load_clip(options.clip, **clip_options(options).given)
     kind = None if options.model == "auto" else options.model
     with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
         ground = reconstruct(clip, kind=kind)

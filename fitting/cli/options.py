@@ -4,11 +4,11 @@ import argparse
 import functools
 import textwrap
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from fitting.runtime import validation
+from fitting.runtime import declarations
 
 if TYPE_CHECKING:
     from fitting.clips.load import ClipOptions
@@ -111,12 +111,12 @@ def subcommands(metavar: str, *commands: Command) -> Option:
 
 def number(low: int | float, high: int | float, unit: str = "") -> Callable[[str], float]:
     """A number in a range, as the `type` of an option."""
-    return _read(float, validation.number(low, high, unit))
+    return _read(float, declarations.number(low, high, unit))
 
 
 def count(low: int, high: int) -> Callable[[str], int]:
     """A whole number in a range, as the `type` of an option."""
-    return _read(int, validation.count(low, high))
+    return _read(int, declarations.count(low, high))
 
 
 def rates(text: str) -> list[float]:
@@ -125,7 +125,7 @@ def rates(text: str) -> list[float]:
 
 
 def _read(
-    convert: Callable[[str], Number], wanted: validation.Constraint
+    convert: Callable[[str], Number], wanted: declarations.Constraint
 ) -> Callable[[str], Number]:
     def read(text: str) -> Number:
         try:
@@ -139,7 +139,7 @@ def _read(
     return read
 
 
-rate = _read(float, validation.RATE)
+rate = number(1, 1000, "Hz")
 
 CLIP_GROUP = "how the clip is read (default: recognised or guessed)"
 CLIP_UNITS = (
@@ -178,9 +178,7 @@ def clip_options(options: argparse.Namespace) -> "ClipOptions":
     """What `CLIP_OPTIONS` add."""
     from fitting.clips.load import ClipOptions
 
-    return ClipOptions(
-        **{field.name: getattr(options, field.name) for field in fields(ClipOptions)}
-    )
+    return ClipOptions(**{name: getattr(options, name) for name in declarations.keys(ClipOptions)})
 
 
 TERRAIN_OPTIONS = group(
@@ -191,7 +189,7 @@ TERRAIN_OPTIONS = group(
         help="metres per unit of its file, 0.01 for centimetres (default: 1); of a .png, per level",
     ),
     argument(
-        "--terrain-offset", type=number(-1e6, 1e6, "metres"), nargs=3, default=(0.0, 0.0, 0.0),
+        "--terrain-offset", type=number(-1e6, 1e6, "metres"), nargs=3,
         metavar=("X", "Y", "Z"), help="then move it, m, y up",
     ),
     argument(
@@ -206,8 +204,9 @@ def terrain_options(options: argparse.Namespace) -> "TerrainOptions":
     """What `TERRAIN_OPTIONS` add."""
     from fitting.ground.meshes import TerrainOptions
 
-    x, y, z = options.terrain_offset
-    return TerrainOptions(options.file_up, options.terrain_scale, (x, y, z), options.terrain_cell)
+    known = declarations.keys(TerrainOptions)
+    values = {name: getattr(options, name) for name in known if getattr(options, name) is not None}
+    return TerrainOptions(**{name: known[name].constraint.convert(v) for name, v in values.items()})
 
 
 ADDRESS = (

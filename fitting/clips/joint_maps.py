@@ -19,6 +19,7 @@ from pathlib import Path
 import tomli_w
 
 from fitting.runtime import validation
+from fitting.runtime.declarations import TEXT
 
 SIDES = {"left": 1.0, "right": -1.0}
 
@@ -60,7 +61,6 @@ MECHANISM = ("org", "mch")  # prefixes of Rigify's copies of a skeleton, which d
 LegJoints = tuple[int, int, int, int | None]  # hip, knee, ankle and toe
 
 ROLE = re.compile(r"pelvis|(hip|knee|ankle|toe)_.+")
-NAME = validation.Constraint("the name of a joint", validation.TEXT.accepts)
 ADVICE = (
     "write a map with `jaxik inspect CLIP --joints > MAP.toml`, correct it, and give it as "
     "--joints MAP.toml"
@@ -376,8 +376,8 @@ def check_joint_map(content: validation.Table, where: str) -> dict[str, str]:
                 f"{where}: {role!r} is no role; wanted pelvis, and hip_NAME, knee_NAME, ankle_NAME "
                 "and toe_NAME of each leg"
             )
-        if not NAME.accepts(name):
-            raise ValueError(f"{where}: {role} is {name!r}; wanted {NAME.description}")
+        if not TEXT.accepts(name):
+            raise ValueError(f"{where}: {role} is {name!r}; wanted the name of a joint")
     if "pelvis" not in content:
         raise ValueError(f"{where}: there is no pelvis; a joint map names it, and legs")
     return dict(content)

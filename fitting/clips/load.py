@@ -1,10 +1,11 @@
 """`load_clip`: opens a motion file with the reader that its suffix selects."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from fitting.runtime.declarations import key, keys
 from fitting.runtime.validation import check_file
 
 from . import edit, formats
@@ -16,45 +17,57 @@ from .formats.gltf import SUFFIXES as GLTF
 from .formats.gltf import read_gltf
 from .formats.npz import read_npz
 from .joint_maps import read_joint_map, template
+from .skating import Travel
 
 JointMap = Mapping[str, str] | str | Path
 """Role to joint name, see `joint_maps.find_roles`; or a file that `clips.joint_maps` reads."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ClipOptions:
     """What the user knows better than a motion file; None leaves it to be read or guessed.
 
-    The fields are arguments of `load_clip`: `load_clip(path, **vars(options))`.
+    The fields are arguments of `load_clip`.
     """
 
-    joints: JointMap | None = None
-    """Which joint is which."""
-    scale: float | None = None
-    """Metres per unit of the file."""
-    up: str | None = None
-    """Either "y" or "z"."""
-    asf: Path | None = None
-    """Skeleton of an AMC file."""
-    animation: str | None = None
-    """Which animation of a glTF file."""
-    travel: str | None = None
-    """Whether the root travels as standing feet show: one of `clips.skating.TRAVELS`."""
-    sole: float | None = None
-    """m, of the balls of flat feet over their soles."""
+    joints: Path | Mapping[str, str] | None = key(
+        None,
+        "Which joint of reference and base is which: a map of joints.",
+        wanted="a file, or a table of joint names by role",
+    )
+    scale: float | None = key(
+        None, "Metres per unit of reference and base; left out, guessed.", "", 1e-9, 1e6
+    )
+    up: Literal["y", "z"] | None = key(None, "Up axis of reference and base; left out, guessed.")
+    asf: Path | None = key(None, "The skeleton of an .amc, where it is not beside it.")
+    animation: str | None = key(None, "Which animation of a .glb or .gltf that has several.")
+    travel: Travel | None = key(
+        None,
+        "Whether the roots of reference and base are moved so that standing feet stay put, or left,"
+        " or moved where the clip is clearly a cycle in place; left out, auto.",
+    )
+    sole: float | None = key(
+        None,
+        "Height of the balls of reference and base over their soles; left out, measured or"
+        " estimated.",
+        "m",
+        0,
+        10,
+    )
 
     def of_file(self, path: Path) -> "ClipOptions":
         """Those that a file of this format takes, where several files share the options."""
         suffix = path.suffix.lower()
         if suffix == ".npz":
             return ClipOptions(sole=self.sole)
-        asf = self.asf if suffix == ".amc" else None
-        return replace(self, asf=asf, animation=self.animation if suffix in GLTF else None)
+        other = [("asf", {".amc"}), ("animation", GLTF)]
+        taken = {name: None for name, suffixes in other if suffix not in suffixes}
+        return ClipOptions(**(self.given | taken))
 
     @property
     def given(self) -> dict[str, Any]:
         """The options that are not None, by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: getattr(self, name) for name in keys(ClipOptions)}
         return {name: value for name, value in values.items() if value is not None}
 
     def check_use(self, files: Iterable[Path], where: str) -> None:

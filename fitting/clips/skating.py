@@ -6,6 +6,7 @@ much in a root that travels too far for its steps.
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -14,7 +15,8 @@ from scipy.ndimage import gaussian_filter1d
 from . import contacts
 from .rigs import unit
 
-TRAVELS = ("auto", "stances", "none")
+Travel = Literal["auto", "stances", "none"]
+TRAVELS = get_args(Travel)
 LOW = 0.04  # m over its lowest twentieth, of an adult's ball that may stand
 SWING = 0.25  # s: width of the Gaussian that takes the pelvis' swing out of its way and heading
 MOST = 500  # velocities among which the common one is sought

@@ -1,15 +1,17 @@
 """An experiment: which parameters of which system are fitted to which clips."""
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
 import jaxik
 from fitting.clips import Clip
 from fitting.clips.load import ClipOptions
+from fitting.ground.ground_path import Root
 from fitting.ground.meshes import TerrainOptions
 from fitting.inference.noise import NoiseOptions
 from fitting.inference.optimise.solution import MAX_STARTS, SearchSettings
@@ -17,7 +19,7 @@ from fitting.inference.sample.blocks import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.capture_system import with_capture
 from fitting.problem.problem import Loss
-from fitting.problem.scene import LEAST_SIGMAS
+from fitting.problem.scene import LEAST_SIGMAS, WHITENED
 from fitting.problem.space import (
     FreeParameter,
     Priors,
@@ -27,6 +29,7 @@ from fitting.problem.space import (
     make_space,
 )
 from fitting.runtime import validation
+from fitting.runtime.declarations import NEEDED, TABLE, Key, key, keys, number
 from fitting.runtime.display import Shown
 from fitting.runtime.precision import with_floats
 from jaxik.world import body
@@ -34,18 +37,33 @@ from jaxik.world.terrain import Terrain
 
 from . import file_tables
 from .file_tables import Ablation, Hierarchy
-from .systems import DEFAULT_PRESET, OWN_ROOT, Preset, with_parameters, with_rules
+from .systems import DEFAULT_PRESET, OWN_ROOT, Body, Preset, with_parameters, with_rules
 
-DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
-    "ankle": 0.02,  # m
-    "knee": 0.03,  # m
-    "pelvis": 0.02,  # m
-    "foot": 0.10,  # rad
-    "body": float("inf"),  # rad
-    "contact": float("inf"),
-    "smooth": float("inf"),  # m/s²
-    "correlation": 0.0,
-}
+DEVIATION = "Standard deviation of the residuals of"
+SIGMAS = {  # by kind: what a good fit of captured motion leaves, meaning and unit
+    "ankle": (0.02, f"{DEVIATION} ankle positions.", "m"),
+    "knee": (0.03, f"{DEVIATION} knee positions.", "m"),
+    "pelvis": (0.02, f"{DEVIATION} the pelvis's position.", "m"),
+    "foot": (0.10, f"{DEVIATION} the rotation of the ankle joints.", "rad"),
+    "body": (math.inf, f"{DEVIATION} the rotation of the pelvis.", "rad"),
+    "contact": (math.inf, f"{DEVIATION} the weight of contact.", ""),
+    "smooth": (
+        math.inf, f"{DEVIATION} the acceleration of the ankles, which should be 0.", "m/s²"
+    ),
+}  # fmt: skip
+SIGMA_KEYS = {
+    kind: Key(
+        number(LEAST_SIGMAS.get(kind, 1e-9), 1e9, or_inf=True),
+        f"{meaning} Infinity leaves them out.",
+        unit,
+        default,
+    )
+    for kind, (default, meaning, unit) in SIGMAS.items()
+} | {"correlation": Key(number(0, 0.999), "Correlation of residuals from frame to frame.", "", 0.0)}
+CORRELATION = SIGMA_KEYS["correlation"]._replace(default=None)
+OWN_CORRELATIONS = {f"correlation.{kind}": CORRELATION for kind in WHITENED}  # not one for all
+ALL_SIGMA_KEYS = SIGMA_KEYS | OWN_CORRELATIONS
+DEFAULT_SIGMAS = {kind: declared.default for kind, declared in SIGMA_KEYS.items()}
 
 
 class LoadedFiles(NamedTuple):
@@ -57,97 +75,60 @@ class LoadedFiles(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ClipEntry:
+class ClipEntry(TerrainOptions, ClipOptions):
     """One clip of an experiment."""
 
-    reference: Path
-    """The captured motion."""
-    terrain: Path
-    base: Path | None = None
-    """The flat animation; None makes one from the reference."""
-    truth: Path | None = None
-    """Parameters that made a synthetic reference, for the report."""
-    start: float = 0.0
-    """Seconds."""
-    end: float | None = None
-    """Seconds."""
-    file_up: str = "y"
-    """Up axis of the terrain's file."""
-    label: str = "captured"
-    """What plots call the reference."""
-    mask_pops: bool = True
-    """Ignores frames in which a captured marker jumps."""
-    held_out: bool = False
-    """Not fitted, but compared with; then no other clip has a part that is held out."""
-    root: str = "auto"
-    """Where the base's root is put: one of `ground_path.ROOTS`."""
-    tracks: Path | None = None
-    """What changes along the base; see `track_files`."""
-    subject: str | None = None
-    """Whom it shows."""
-    joints: Mapping[str, str] | Path | None = None
-    """Which joint of reference and base is which; here and below, an `.npz` needs none of it."""
-    scale: float | None = None
-    """Metres per unit of reference and base."""
-    up: str | None = None
-    """Up axis of reference and base."""
-    asf: Path | None = None
-    """Skeleton of an `.amc`."""
-    animation: str | None = None
-    """Which animation of a glTF file that has several."""
-    travel: str | None = None
-    """Whether the roots of reference and base travel as standing feet show."""
-    sole: float | None = None
-    """m, of the balls of their feet over the soles."""
-    terrain_scale: float | None = None
-    """Metres per unit of the terrain's file."""
-    terrain_offset: tuple[float, float, float] | None = None
-    """m, by which the terrain is moved."""
-    terrain_cell: float | None = None
-    """m, between heights of a terrain that does not say it."""
+    reference: Path = key(NEEDED, "The captured motion: a clip.")
+    terrain: Path = key(NEEDED, "The ground under it: a mesh or a heightfield.")
+    base: Path | None = key(None, "The flat animation; left out, it is made from the reference.")
+    truth: Path | None = key(None, "Parameters that made a synthetic reference, for the report.")
+    start: float = key(0.0, "Where the part of the clip that counts begins.", "s", 0, 1e6)
+    end: float | None = key(None, "Where it ends; left out, with the clip.", "s", 0, 1e6)
+    label: str = key("captured", "What plots call the reference.")
+    mask_pops: bool = key(True, "Whether frames in which a captured marker jumps are left out.")
+    held_out: bool = key(False, "Whether the clip is not fitted, but shows what the fit is worth.")
+    root: Root = key(
+        "auto",
+        "Where the root is put: where the animation has it, on the ground below it, or on the"
+        " ground only where foot IK does not reach it.",
+    )
+    tracks: Path | None = key(None, "What changes along the clip: a track file.")
+    subject: str | None = key(None, "Whom the clip shows, for [hierarchy].")
     loaded: LoadedFiles | None = field(default=None, repr=False, compare=False)
     """What is in memory: then the paths of reference, terrain and base are names, and no files."""
 
-    @staticmethod
-    def reading(clip: ClipOptions, terrain: TerrainOptions) -> dict[str, Any]:
-        """The fields that say how reference, base and terrain are read; paths become absolute."""
-        joints = clip.joints
-        return {
-            **vars(clip),
-            "joints": Path(joints).resolve() if isinstance(joints, str | Path) else joints,
-            "asf": None if clip.asf is None else clip.asf.resolve(),
-            "file_up": terrain.file_up,
-            "terrain_scale": terrain.scale,
-            "terrain_offset": terrain.offset if any(terrain.offset) else None,
-            "terrain_cell": terrain.cell,
-        }
-
     @property
-    def clip_options(self) -> ClipOptions:
-        """How reference and base are read."""
-        return ClipOptions(
-            **{field.name: getattr(self, field.name) for field in fields(ClipOptions)}
-        )
-
-    @property
-    def terrain_options(self) -> TerrainOptions:
-        """How the terrain is read."""
-        offset = self.terrain_offset or (0.0, 0.0, 0.0)
-        return TerrainOptions(self.file_up, self.terrain_scale, offset, self.terrain_cell)
+    def paths(self) -> dict[str, Path]:
+        """The files that are named, by key."""
+        values = {name: getattr(self, name) for name in keys(ClipEntry)}
+        return {name: value for name, value in values.items() if isinstance(value, Path)}
 
     def with_paths(self, change: Callable[[Path], Path]) -> "ClipEntry":
         """The entry with each of its paths changed."""
-        paths = {key: value for key, value in vars(self).items() if isinstance(value, Path)}
-        return replace(self, **{key: change(path) for key, path in paths.items()})
+        return replace(self, **{name: change(path) for name, path in self.paths.items()})
 
 
 @dataclass(frozen=True)
 class FitOptions:
     """How the best fit is searched for."""
 
-    starts: int = MAX_STARTS
-    """At most."""
+    starts: int = key(
+        MAX_STARTS,
+        "Independent starts of the search, at most, until enough of them agree.",
+        "",
+        1,
+        1000,
+    )
     search: SearchSettings = SearchSettings()
+
+
+STEPS = ("max_steps",)  # settings of the search that stand in [fit] itself
+SEARCH_KEYS = {name: entry for name, entry in keys(SearchSettings).items() if name not in STEPS}
+FIT_KEYS = {
+    "starts": keys(FitOptions)["starts"],
+    **{name: keys(SearchSettings)[name] for name in STEPS},
+    "search": Key(TABLE, "Settings of the search."),
+}
 
 
 @dataclass(frozen=True)
@@ -160,47 +141,72 @@ class Experiment(Shown):
 
     path: Path
     """Of the file; relative paths in it start from there."""
-    clips: tuple[ClipEntry, ...]
-    free: FreeTable
-    """By dotted name, with overrides of the declaration."""
-    capture: FreeTable = field(default_factory=dict)
-    """What of the captures is fitted, too; see `captures`."""
-    preset: str = DEFAULT_PRESET.name
-    faithful: bool = False
-    """Whether the preset is the original, as faithful as it is known."""
-    body: str = "clip"
-    """Whose defaults are meant: those of the first clip's rig, or of the adult."""
-    name: str = ""
-    fps: float | None = None
-    """Clips are resampled to this rate."""
-    holdout: float = 1 / 3
-    """Fraction of each clip, its end, that is not fitted but compared with."""
-    loss: Loss = "huber"
-    independent_every: float = 0.0
-    """s, spacing at which residuals are independent; 0: as they themselves say."""
-    seed: int = 0
-    rules: Mapping[str, str] = field(default_factory=dict)
-    """By stage, where not the preset's."""
-    parameters: Mapping[str, object] = field(default_factory=dict)
-    """Fixed values by dotted name."""
-    prior: Priors = Priors()
-    """Of the free parameters."""
-    start: Mapping[str, float] = field(default_factory=dict)
-    """Where the search begins, by dotted name; left out: at the system's values."""
-    sigmas: Mapping[str, float] = field(default_factory=dict)
-    """Where not the default."""
-    noise: NoiseOptions = NoiseOptions()
-    """Which properties of the noise are estimated."""
-    fit: FitOptions = FitOptions()
-    sample: SamplerSettings = SamplerSettings()
-    without: tuple[Ablation, ...] = ()
-    """What `jaxik ablate` leaves out in turn."""
-    hierarchy: Hierarchy = Hierarchy()
-    """What the clips have in common."""
-    record_only: bool = False
-    """Whether only what the game's record holds is fitted; see `record_files.restrict`."""
+    clips: tuple[ClipEntry, ...] = key(NEEDED, "The clips.", wanted="[[clips]], one for each clip")
+    free: FreeTable = key(
+        NEEDED,
+        "What is fitted, if anything; {} takes range, kind and scale from the rule's declaration.",
+    )
+    capture: FreeTable = key(
+        {}, "What is not known of the captures and fitted beside the system, for each clip."
+    )
+    preset: str = key(DEFAULT_PRESET.name, "The system that is fitted.")
+    faithful: bool = key(
+        False, "Whether the preset is the original, where the preset differs from it."
+    )
+    body: Body = key(
+        "clip",
+        "Whose numbers and ranges are meant: those of the first clip's body, or of an adult of"
+        " 1.8 m.",
+    )
+    name: str = key("", "Title of the experiment; left out, the file's name.")
+    fps: float | None = key(
+        None, "Rate to which clips are resampled; left out, none.", "Hz", 1, 1000
+    )
+    holdout: float = key(
+        1 / 3,
+        "Fraction of each clip, its end, that is not fitted but shows what the fit is worth; clips"
+        " of less than 3 s are fitted whole.",
+        "",
+        0.0,
+        0.9,
+    )
+    loss: Loss = key(
+        "huber",
+        "How residuals count; all but squares give a few wrong frames less influence. Left out,"
+        " huber; squares where sigmas are estimated.",
+    )
+    independent_every: float = key(
+        0.0, "Time between residuals that count as independent; at 0 as [noise] says.", "s", 0, 1e6
+    )
+    seed: int = key(0, "Of all random numbers.", "", 0, 2**32 - 1)
+    rules: Mapping[str, str] = key({}, "Rules that differ from the preset's, by stage.")
+    parameters: Mapping[str, object] = key({}, "Fixed values that differ from the preset's.")
+    prior: Priors = key(Priors(), "What is known of free parameters before any clip.")
+    start: Mapping[str, float] = key(
+        {}, "Where the search begins; left out, at the system's values."
+    )
+    sigmas: Mapping[str, float] = key({}, "Standard deviation of each kind of residual.")
+    noise: NoiseOptions = key(
+        NoiseOptions(), "Which properties of the noise are estimated, and what for."
+    )
+    fit: FitOptions = key(FitOptions(), "How the best fit is searched for.")
+    sample: SamplerSettings = key(SamplerSettings(), "How `jaxik sample` samples the posterior.")
+    without: tuple[Ablation, ...] = key(
+        (), "Variants that `jaxik ablate` fits.", wanted="[[without]], one for each variant"
+    )
+    hierarchy: Hierarchy = key(
+        Hierarchy(), "What several clips and subjects have in common; left out, everything."
+    )
+    record_only: bool = key(
+        False, "Whether free parameters that the game's record has no room for are left out."
+    )
+    written_in: str | None = key(
+        None,
+        "Where the file was written: paths start there that lead nowhere from the file itself, as"
+        " after moving a run alone.",
+    )
     whole: "Experiment | None" = None
-    """What such an experiment was made of."""
+    """What an experiment of the record alone was made of."""
     system: jaxik.FootIK | None = field(default=None, repr=False, compare=False)
     """With any rules, instead of those of preset and `rules`; for any body as it is."""
 

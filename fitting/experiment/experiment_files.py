@@ -1,36 +1,4 @@
-"""Experiment files: TOML, checked key by key.
-
-preset = "record"                    # a function of jaxik.presets
-faithful = true                      # the original, where the preset differs from it
-body = "clip"                        # its defaults: for the first clip's rig, or for the "adult"
-record_only = true                   # leave out what the game's record has no room for
-written_in = "/runs/walk"            # where paths start that lead nowhere from this file: of runs
-rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
-[[clips]]
-reference = "walk.npz"               # the captured motion; paths are relative to this file
-base = "walk_base.npz"               # the flat animation; left out, one is made from the reference
-terrain = "course.ply"
-joints = "map.toml"                  # and scale, up, asf: how clips are read where it is not known
-terrain_scale = 0.01                 # and terrain_offset, terrain_cell, file_up: likewise
-[parameters]                         # fixed values that differ from the preset's
-lock.enabled = true
-[free]                               # {} takes range and scale from the rule
-pelvis.on_gain = {}
-contact.planted_height = { low = 0.05, high = 0.2 }
-[capture]                            # what of the captures is fitted, too; see `captures`
-ground_height = {}
-[prior]                              # see `experiment.file_tables`, also for [start]
-spread = 1.6
-[sigmas]
-ankle = 0.02
-[noise]                              # which of its properties are estimated
-sigmas = "estimated"
-[fit.search]                         # overrides settings of the search, see `SearchSettings`
-final_sweeps = 12
-[[without]]                          # see `ablations`
-name = "locks"
-parameters = { lock.enabled = false }
-"""
+"""Experiment files: TOML, checked key by key as `Experiment` declares it; the page shows all."""
 
 import dataclasses
 import math
@@ -41,47 +9,39 @@ from typing import Any, NamedTuple
 import tomli_w
 
 from fitting.clips.joint_maps import check_joint_map, read_joint_map
-from fitting.inference.noise import NoiseOptions
-from fitting.inference.optimise.solution import MAX_STARTS, SearchSettings
-from fitting.inference.sample.blocks import SamplerSettings
-from fitting.inference.settings import Setting, Settings, describe
+from fitting.inference.optimise.solution import SearchSettings
 from fitting.runtime import validation
+from fitting.runtime.declarations import changed, check_table, keys
 from fitting.runtime.files import relative_path
-from fitting.runtime.validation import (
-    Content,
-    Table,
-    check_table,
-    flatten,
-    nest,
-    with_floats,
-)
+from fitting.runtime.validation import Content, Table, flatten, nest
 
 from . import file_tables
-from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
+from .experiment import (
+    ALL_SIGMA_KEYS,
+    DEFAULT_SIGMAS,
+    FIT_KEYS,
+    OWN_CORRELATIONS,
+    SEARCH_KEYS,
+    SIGMAS,
+    STEPS,
+    ClipEntry,
+    Experiment,
+    FitOptions,
+)
 from .file_tables import (
-    hierarchy_to_table,
+    Hierarchy,
+    check_hierarchy,
     priors_to_table,
     read_ablations,
-    read_hierarchy,
     read_priors,
     read_start,
 )
 from .record_files import restrict
-from .schema import (
-    CLIP_KEYS,
-    CORRELATIONS,
-    FILE_KEYS,
-    FIT_KEYS,
-    KINDS,
-    NOISE_KEYS,
-    SAMPLE_KEYS,
-    SEARCH_KEYS,
-    SIGMA_KEYS,
-    TOP_KEYS,
-)
 from .systems import DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
+# The first keys of a clip, in the order that digests of unfinished campaigns know.
+FIRST = ("reference", "terrain", "base", "truth", "start", "end", "file_up")
 
 
 def load_experiment(path: str | Path) -> Experiment:
@@ -100,82 +60,55 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
 
     Where one leads nowhere, it starts from where the file was written, if the table says so.
     """
-    check_table(content, TOP_KEYS, f"{path}")
-    if not content.get("clips"):
+    if isinstance(content.get("clips", []), list) and not content.get("clips"):
         raise ValueError(f"{path}: there is no [[clips]]; an experiment has at least one of them")
     if "free" not in content:
         raise ValueError(f"{path}: there is no [free]; it may be empty, where nothing is fitted")
+    top = check_table({**content, "fit": {}}, keys(Experiment), f"{path}")
+    top["fit"] = _fit_options(content.get("fit", {}), f"{path} [fit]")
     with validation.error_context(path):
         ik = preset_system(
-            content.get("preset", DEFAULT_PRESET.name), faithful=content.get("faithful", False)
+            top.get("preset", DEFAULT_PRESET.name), faithful=top.get("faithful", False)
         )
-    ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
-    sigmas = flatten(content.get("sigmas", {}), 2)
-    check_table(sigmas, SIGMA_KEYS, f"{path} [sigmas]")
-    if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in KINDS):
-        raise ValueError(f"{path} [sigmas]: all of {list(KINDS)} are inf; wanted one that is not")
-    free = read_free_table(content["free"], f"{path} [free]")
-    without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
-    places = Places(path, content.get("written_in"))
-    clips = tuple(read_clip(entry, places) for entry in content["clips"])
-    capture = file_tables.read_capture(content.get("capture", {}), len(clips), f"{path} [capture]")
+    ik = with_rules(ik, top.get("rules", {}), f"{path} [rules]")
+    sigmas = check_table(flatten(top.get("sigmas", {}), 2), ALL_SIGMA_KEYS, f"{path} [sigmas]")
+    if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in SIGMAS):
+        raise ValueError(f"{path} [sigmas]: all of {list(SIGMAS)} are inf; wanted one that is not")
+    free = read_free_table(top["free"], f"{path} [free]")
+    without = read_ablations(top.get("without", ()), ik, f"{path} [[without]]")
+    places = Places(path, top.pop("written_in", None))  # another is named when it is written again
+    clips = tuple(_with_files(entry, places) for entry in top["clips"])
+    capture = file_tables.read_capture(top.get("capture", {}), len(clips), f"{path} [capture]")
     known = [*free, *(name for ablation in without for name in ablation.free)]
     known = list(dict.fromkeys([*known, *file_tables.known_names(capture, len(clips))]))
-    count = len(free) + len(file_tables.free_table(capture, len(clips)))
-    subjects, hierarchy = [clip.subject for clip in clips], content.get("hierarchy", {})
-    tables = {
+    subjects = [clip.subject for clip in clips]
+    check_hierarchy(top.get("hierarchy", Hierarchy()), free, subjects, f"{path} [hierarchy]")
+    top |= {
         "clips": clips,
-        "hierarchy": read_hierarchy(hierarchy, free, subjects, f"{path} [hierarchy]"),
         "free": free,
         "capture": capture,
-        "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
-        "start": read_start(content.get("start", {}), known, f"{path} [start]"),
-        "parameters": flatten(content.get("parameters", {}), 2),
-        "sigmas": with_floats(sigmas, sigmas),
-        "noise": _noise_options(content.get("noise", {}), f"{path} [noise]"),
+        "prior": read_priors(top.get("prior", {}), known, f"{path} [prior]"),
+        "start": read_start(top.get("start", {}), known, f"{path} [start]"),
+        "parameters": flatten(top.get("parameters", {}), 2),
+        "sigmas": sigmas,
         "without": without,
-        "fit": _fit_options(content.get("fit", {}), f"{path}"),
-        "sample": _sampler_settings(content.get("sample", {}), count, f"{path} [sample]"),
     }
-    top = with_floats(content, ("fps", "holdout", "independent_every"))
-    top.pop("written_in", None)  # another folder is named when it is written again
     defaults: Content = {"path": path, "name": path.stem}
-    if tables["noise"].sigmas == "estimated":  # which takes a distribution of noise
+    if "noise" in top and top["noise"].sigmas == "estimated":  # a distribution of noise
         defaults["loss"] = "squares"
-    experiment = Experiment(**{**defaults, **top, **tables})
+    experiment = Experiment(**(defaults | top))
+    with validation.error_context(f"{path} [sample]"):
+        experiment.sample.walkers_for(experiment.free_count)
     return restrict(experiment) if experiment.record_only else experiment
 
 
-def _values(table: Table, settings: type[Settings]) -> Content:
-    return {name: _value(value, describe(settings)[name]) for name, value in table.items()}
-
-
-def _value(value: Any, declared: Setting) -> Any:
-    """A value as its setting holds it: a tuple for a list, and a float unless it is a count."""
-    if isinstance(value, list):
-        return tuple(_value(entry, declared) for entry in value)
-    return float(value) if type(value) is int and not declared.integer else value
-
-
-def _noise_options(value: object, where: str) -> NoiseOptions:
-    return NoiseOptions(**check_table(value, NOISE_KEYS, where))
-
-
 def _fit_options(value: object, where: str) -> FitOptions:
-    table = check_table(value, FIT_KEYS, f"{where} [fit]")
-    changed = check_table(table.get("search", {}), SEARCH_KEYS, f"{where} [fit.search]")
-    search = _values(changed, SearchSettings)
-    search |= {"max_steps": table["max_steps"]} if "max_steps" in table else {}
-    with validation.error_context(f"{where} [fit.search]"):
-        return FitOptions(table.get("starts", MAX_STARTS), SearchSettings(**search))
-
-
-def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSettings:
-    table = check_table(value, SAMPLE_KEYS, where)
+    table = check_table(value, FIT_KEYS, where)
+    where = f"{where[:-1]}.search]"
+    search = check_table(table.pop("search", {}), SEARCH_KEYS, where)
+    steps = {name: table.pop(name) for name in STEPS if name in table}
     with validation.error_context(where):
-        sampler = SamplerSettings(**_values(table, SamplerSettings))
-        sampler.walkers_for(free_count)
-    return sampler
+        return FitOptions(**table, search=SearchSettings(**(search | steps)))
 
 
 def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> str:
@@ -187,33 +120,38 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
             together with what they name; it is named itself, so that it may be moved alone. None
             writes absolute paths.
     """
-    fit, sampler = experiment.fit, dataclasses.asdict(experiment.sample)
-    fit_table: Content = {"starts": fit.starts, "max_steps": fit.search.max_steps}
+    fit, sampler = experiment.fit, experiment.sample
     search = dataclasses.replace(fit.search, max_steps=SearchSettings().max_steps)
-    if changed := _changed(search):
-        fit_table["search"] = changed
-    usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
-    named = tuple(dataclasses.replace(entry, loaded=None) for entry in experiment.clips)
-    plain = dataclasses.replace(experiment, clips=named, whole=None, system=None)
-    content = dataclasses.asdict(plain)
-    content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
-    content["prior"] = priors_to_table(experiment.prior)
-    content["hierarchy"] = hierarchy_to_table(experiment.hierarchy)
+    fit_table: Content = {"starts": fit.starts, "max_steps": fit.search.max_steps}
+    if others := changed(search):
+        fit_table["search"] = others
+    content = {name: getattr(experiment, name) for name in keys(Experiment)} | {
+        "clips": [clip_to_table(entry) for entry in experiment.clips],
+        "fit": fit_table,
+        "sample": {name: getattr(sampler, name) for name in USUAL_SAMPLE_KEYS} | changed(sampler),
+        "prior": priors_to_table(experiment.prior),
+        "hierarchy": changed(experiment.hierarchy),
+        "noise": vars(experiment.noise),
+        "without": [vars(ablation) for ablation in experiment.without],
+        "sigmas": _nest_sigmas(experiment.sigmas),
+        "written_in": None if folder is None else folder.resolve().as_posix(),
+    }
     for name in ("free", "start", "parameters"):
         content[name] = nest(content[name])
-    each = {name: content["sigmas"].pop(name) for name in CORRELATIONS if name in content["sigmas"]}
-    content["sigmas"] |= nest(each)
-    del content["path"]
-    if folder is not None:
-        content["written_in"] = folder.resolve().as_posix()
     return tomli_w.dumps(_plain(content, folder))
 
 
-def _changed(settings: Settings) -> Content:
-    """The settings that do not have their default value."""
-    defaults = dataclasses.asdict(type(settings)())
-    values = dataclasses.asdict(settings)
-    return {key: value for key, value in values.items() if value != defaults[key]}
+def clip_to_table(entry: ClipEntry) -> Content:
+    """The keys of a clip that have a value, with it."""
+    values = {name: getattr(entry, name) for name in dict.fromkeys([*FIRST, *keys(ClipEntry)])}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _nest_sigmas(sigmas: Table) -> Content:
+    """Sigmas by kind as a table, in which each kind may have a correlation."""
+    return {name: sigmas[name] for name in sigmas if name not in OWN_CORRELATIONS} | nest(
+        {name: sigmas[name] for name in sigmas if name in OWN_CORRELATIONS}
+    )
 
 
 def _plain(value: Any, folder: Path | None) -> Any:
@@ -234,7 +172,7 @@ class Places(NamedTuple):
     written_in: str | None = None
     """The folder in which it was written, from where its paths led."""
 
-    def find(self, path: str, what: str) -> Path:
+    def find(self, path: Path, what: str) -> Path:
         """The file that a path names: from the experiment file, or else from where that was.
 
         Args:
@@ -254,42 +192,27 @@ class Places(NamedTuple):
                 return before
             if before != here:
                 reason += f" at {here}, nor at {before}, to where it led when this was written"
-        raise ValueError(f"{self.file} [[clips]]: {what} {path!r}: {reason}")
+        raise ValueError(f"{self.file} [[clips]]: {what} {str(path)!r}: {reason}")
 
 
-def read_clip(value: object, places: Places) -> ClipEntry:
-    """An entry of [[clips]].
-
-    Args:
-        value: what the file has there.
-        places: the file, and where its paths start.
+def _with_files(entry: ClipEntry, places: Places) -> ClipEntry:
+    """An entry of [[clips]] with its paths where its files are.
 
     Raises:
-        ValueError: a key is unknown or missing, a value has the wrong type, a file does not exist,
-            or an option belongs to none of the files.
+        ValueError: a file does not exist, the clip ends before it starts, or an option belongs to
+            none of the files.
     """
-    path = places.file
-    table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry = with_floats(table, ("start", "end", "scale", "sole", "terrain_scale", "terrain_cell"))
-    for key in ("reference", "terrain"):
-        if key not in table:
-            raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
-    has_joint_table = isinstance(table.get("joints"), Mapping)
-    for key in (*FILE_KEYS, *(() if has_joint_table else ("joints",))):
-        if key in table:
-            entry[key] = places.find(table[key], key)
-    if "end" in table and table["end"] <= table.get("start", 0.0):
+    where = f"{places.file} [[clips]]"
+    found = {name: places.find(path, name) for name, path in entry.paths.items()}
+    entry = dataclasses.replace(entry, **found)
+    if entry.end is not None and entry.end <= entry.start:
         raise ValueError(
-            f"{path} [[clips]]: end is {table['end']}; wanted more than start, which is "
-            f"{table.get('start', 0.0)}"
+            f"{where}: end is {entry.end}; wanted more than start, which is {entry.start}"
         )
-    if has_joint_table:
-        entry["joints"] = check_joint_map(table["joints"], f"{path} [[clips]] joints")
-    elif "joints" in table:
-        read_joint_map(entry["joints"])  # reports mistakes before any clip is read
-    if "terrain_offset" in table:
-        entry["terrain_offset"] = tuple(float(number) for number in table["terrain_offset"])
-    clip = ClipEntry(**entry)
-    files = [clip.reference] if clip.base is None else [clip.reference, clip.base]
-    clip.clip_options.check_use(files, f"{path} [[clips]]")
-    return clip
+    if isinstance(entry.joints, Path):
+        read_joint_map(entry.joints)  # reports mistakes before any clip is read
+    elif entry.joints is not None:
+        check_joint_map(entry.joints, f"{where} joints")
+    files = [entry.reference] if entry.base is None else [entry.reference, entry.base]
+    entry.check_use(files, where)
+    return entry

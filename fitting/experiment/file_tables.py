@@ -1,44 +1,9 @@
-"""Ablations: an experiment with something left out, as each of its [[without]] tables says.
-
-[[without]]
-name = "support"
-rules = { pelvis = "LowestPelvis" }     # other rules, by stage
-parameters = { lock.enabled = false }   # fixed at these values, even if they are free otherwise
-free = { pelvis.limit = {} }            # fitted in addition
-
-The table [capture] of an experiment: what of the captures is fitted beside the system.
-
-[capture]
-ground_height = {}                    # for each clip; {} takes the range from `Capture`
-time_shift = { low = -0.05, high = 0.05 }
-"ankle_up[1]" = {}                    # of the second clip only
-[prior.capture]                       # narrow unless it says otherwise
-ground_height = { centre = 0.03 }
-
-The table [hierarchy] of an experiment file: what several clips and subjects have in common.
-
-[hierarchy]
-per_subject = ["target.foot_height"]  # one value for each subject that [[clips]] name
-per_clip = ["lean.gain"]              # one for each clip; all other free parameters are shared
-scale_with_body = true                # numbers are for the body of the first clip, or the adult
-                                      # (`body`); those of other bodies are dynamically similar
-
-The tables [prior] and [start] of an experiment file: what is known before any clip.
-
-[prior]                              # of every free parameter that has no table of its own
-shape = "normal"                     # or "uniform": anywhere in the range
-spread = 1.6                         # standard deviation, of u
-[prior.pelvis]
-on_gain = { centre = 0.3, spread = 1.0 }  # median, in the parameter's unit
-limit = { shape = "uniform" }
-[start]                              # where the search begins, in the parameters' units
-pelvis.on_gain = 0.5
-"""
+"""What the tables of an experiment say that take its system or its clips to read."""
 
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeVar, get_args
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -47,17 +12,10 @@ from fitting.inference.mixed_model import Grouping
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.capture_system import PREFIX, is_of_capture, without_ends
 from fitting.problem.scene import GROUND, SHIFT, SPREAD, Capture, Scene
-from fitting.problem.space import SPREADS, ParameterPrior, Priors, Shape, Space
+from fitting.problem.space import ParameterPrior, Priors, Space
 from fitting.runtime import validation
-from fitting.runtime.validation import (
-    Content,
-    Table,
-    check_keys,
-    check_table,
-    flatten,
-    nest,
-    with_floats,
-)
+from fitting.runtime.declarations import NEEDED, NUMBER, Key, check_table, key, keys
+from fitting.runtime.validation import Content, Table, check_keys, flatten, nest
 from jaxik.maths import parameter_tree
 from jaxik.stages.probe.capsule import SweepProbe
 
@@ -69,84 +27,56 @@ Entry = TypeVar("Entry")
 CAPTURE_NAMES = tuple(parameter_tree.declarations(Capture()))
 
 LEVELS = ("per_subject", "per_clip")
-HIERARCHY_NAMES = validation.list_of_texts("a list of names of free parameters")
-HIERARCHY_KEYS = {
-    "per_subject": HIERARCHY_NAMES.meaning(
-        "Free parameters of which each subject has its own value."
-    ),
-    "per_clip": HIERARCHY_NAMES.meaning("Free parameters of which each clip has its own value."),
-    "scale_with_body": validation.BOOLEAN.meaning(
-        "Whether lengths, speeds and times follow the legs of each clip's body."
-    ),
-}
-
-DEFAULT_KEYS: dict[str, validation.Constraint] = {
-    "shape": validation.one_of(get_args(Shape)).meaning(
-        "Distribution of u, the free parameter on its scale; a uniform one has no centre and no"
-        " spread."
-    ),
-    "spread": validation.number(*SPREADS).meaning("Standard deviation of u."),
-}
-CENTRE = validation.NUMBER.meaning("Median, in the parameter's unit; left out, the system's value.")
-PRIOR_KEYS = {**DEFAULT_KEYS, "centre": CENTRE}
+NAMES = "a list of names of free parameters"
+PRIOR_KEYS = keys(ParameterPrior)
+DEFAULT_KEYS = {name: PRIOR_KEYS[name] for name in ("shape", "spread")}
 
 
 @dataclass(frozen=True)
 class Ablation:
     """What differs from the experiment, under a name."""
 
-    name: str
-    rules: Mapping[str, str] = field(default_factory=dict)
-    """By stage."""
-    parameters: Mapping[str, object] = field(default_factory=dict)
-    """By dotted name."""
-    free: FreeTable = field(default_factory=dict)
-    """By dotted name."""
+    name: str = key(NEEDED, "What is left out.")
+    rules: Mapping[str, str] = key({}, "Other rules, by stage.")
+    parameters: Mapping[str, object] = key({}, "Fixed at these values, even if they are free else.")
+    free: FreeTable = key({}, "Fitted in addition.")
 
 
-ABLATION_KEYS = {
-    "name": validation.TEXT.meaning("What is left out. Needed."),
-    "rules": validation.TABLE.meaning("Other rules, by stage."),
-    "parameters": validation.TABLE.meaning("Fixed at these values, even if they are free else."),
-    "free": validation.TABLE.meaning("Fitted in addition."),
-}
-
-
-def read_ablations(tables: Sequence[object], ik: jaxik.FootIK, where: str) -> tuple[Ablation, ...]:
-    """The ablations in TOML tables.
+def read_ablations(
+    tables: Sequence[Ablation], ik: jaxik.FootIK, where: str
+) -> tuple[Ablation, ...]:
+    """Ablations by the dotted names of parameters.
 
     Args:
-        tables: the tables.
+        tables: as a file has them.
         ik: the system from which they differ.
         where: the tables' place in their file, for error messages.
 
     Raises:
-        ValueError: a key, stage, rule or parameter is unknown; a value is wrong; a name is missing,
-            empty or taken; an ablation changes nothing.
+        ValueError: a stage, rule or parameter is unknown; a value is wrong; a name is empty or
+            taken; an ablation changes nothing.
     """
     ablations: list[Ablation] = []
     for table in tables:
-        ablation = _read(validation.check_table(table, ABLATION_KEYS, where), ik, where)
-        if ablation.name in (COMPLETE, *(earlier.name for earlier in ablations)):
-            raise ValueError(f"{where}: there already is a variant named {ablation.name!r}")
-        ablations.append(ablation)
+        if table.name in (COMPLETE, *(earlier.name for earlier in ablations)):
+            raise ValueError(f"{where}: there already is a variant named {table.name!r}")
+        ablations.append(_read(table, ik, where))
     return tuple(ablations)
 
 
-def _read(table: validation.Table, ik: jaxik.FootIK, where: str) -> Ablation:
-    name = table.get("name", "")
-    if not name.strip():
+def _read(table: Ablation, ik: jaxik.FootIK, where: str) -> Ablation:
+    if not table.name.strip():
         raise ValueError(f"{where}: a variant without a name; wanted name = 'what is left out'")
-    parameters = validation.flatten(table.get("parameters", {}), 2)
-    free = read_free_table(table.get("free", {}), f"{where} {name}: free")
-    rules = dict(table.get("rules", {}))
-    changed = with_rules(ik, rules, f"{where} {name}: rules")
-    with_parameters(changed, parameters, f"{where} {name}: parameters")
+    where = f"{where} {table.name}"
+    parameters = validation.flatten(table.parameters, 2)
+    free = read_free_table(table.free, f"{where}: free")
+    other = with_rules(ik, table.rules, f"{where}: rules")
+    with_parameters(other, parameters, f"{where}: parameters")
     leaves = {full.partition("[")[0]: None for full in free}  # one leg's element has an index
-    validation.check_keys(leaves, leaf_names(changed), f"{where} {name}: free")
-    if not parameters and not free and rule_names(changed) == rule_names(ik):
-        raise ValueError(f"{where} {name}: changes nothing; wanted other rules or parameters")
-    return Ablation(name, rules, parameters, free)
+    validation.check_keys(leaves, leaf_names(other), f"{where}: free")
+    if not parameters and not free and rule_names(other) == rule_names(ik):
+        raise ValueError(f"{where}: changes nothing; wanted other rules or parameters")
+    return dataclasses.replace(table, parameters=parameters, free=free)
 
 
 def read_capture(table: Table, clips: int, where: str) -> FreeTable:
@@ -167,7 +97,8 @@ def read_capture(table: Table, clips: int, where: str) -> FreeTable:
     for name in table:
         if "[" in name and name[name.index("[") :] not in numbers:
             raise ValueError(f"{where}: no clip for {name!r}; wanted a number of {numbers}")
-    return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in table.items()}
+        check_table(table[name], FREE_KEYS, f"{where} {name}")
+    return table
 
 
 def free_table(capture: FreeTable, clips: int) -> FreeTable:
@@ -269,16 +200,19 @@ def refuse(capture: FreeTable, where: str, command: str) -> None:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Hierarchy:
     """What several clips and subjects have in common."""
 
-    per_subject: tuple[str, ...] = ()
-    """Names of free parameters that each subject has its own value of."""
-    per_clip: tuple[str, ...] = ()
-    """Likewise, each clip."""
-    scale_with_body: bool = False
-    """Whether lengths, speeds and times follow the legs of each clip's body."""
+    per_subject: tuple[str, ...] = key(
+        (), "Free parameters of which each subject has its own value.", wanted=NAMES
+    )
+    per_clip: tuple[str, ...] = key(
+        (), "Free parameters of which each clip has its own value.", wanted=NAMES
+    )
+    scale_with_body: bool = key(
+        False, "Whether lengths, speeds and times follow the legs of each clip's body."
+    )
 
     @property
     def varying(self) -> tuple[str, ...]:
@@ -307,33 +241,30 @@ class Hierarchy:
         return Grouping.of_labels([labels[self.level(name)] for name in names])
 
 
-def read_hierarchy(
-    value: object, free: Collection[str], subjects: Sequence[str | None], where: str
-) -> Hierarchy:
-    """The [hierarchy] of an experiment.
+def check_hierarchy(
+    hierarchy: Hierarchy, free: Collection[str], subjects: Sequence[str | None], where: str
+) -> None:
+    """Checks the [hierarchy] of an experiment.
 
     Args:
-        value: as TOML reads it.
+        hierarchy: as the file has it.
         free: names of the free parameters.
         subjects: whom each clip shows; None where it does not say.
         where: the table's place in its file, for error messages.
 
     Raises:
-        ValueError: a key is unknown, or a value is wrong; a name is not free or stands twice; a
-            parameter is to vary between subjects, and a clip does not say whom it shows, or all
-            show the same; a parameter is to vary between clips, and there is only one.
+        ValueError: a name is not free or stands twice; a parameter is to vary between subjects, and
+            a clip does not say whom it shows, or all show the same; a parameter is to vary between
+            clips, and there is only one.
     """
-    table = check_table(value, HIERARCHY_KEYS, where)
-    lists = {level: tuple(table.get(level, ())) for level in LEVELS}
-    names = [name for level in LEVELS for name in lists[level]]
-    for name in names:
+    for name in hierarchy.varying:
         if name not in free:
             raise ValueError(f"{where}: {name!r} is not free; free are {sorted(free)}")
-        if names.count(name) > 1:
+        if hierarchy.varying.count(name) > 1:
             raise ValueError(f"{where}: {name!r} stands twice; wanted it per clip or per subject")
-    if lists["per_clip"] and len(subjects) < 2:
+    if hierarchy.per_clip and len(subjects) < 2:
         raise ValueError(f"{where}: per_clip needs two clips or more; there is one")
-    if lists["per_subject"]:
+    if hierarchy.per_subject:
         if None in subjects:
             number = subjects.index(None) + 1
             raise ValueError(
@@ -343,12 +274,6 @@ def read_hierarchy(
             raise ValueError(
                 f"{where}: per_subject needs two subjects or more; all clips are of {subjects[0]!r}"
             )
-    return Hierarchy(**lists, scale_with_body=table.get("scale_with_body", False))
-
-
-def hierarchy_to_table(hierarchy: Hierarchy) -> Content:
-    """The [hierarchy] table; empty for the default."""
-    return {name: value for name, value in dataclasses.asdict(hierarchy).items() if value}
 
 
 def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
@@ -366,29 +291,25 @@ def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
     """
     entries = flatten(table, 2)
     check_keys(entries, [*DEFAULT_KEYS, *free], where)
-    default = {key: entries.pop(key) for key in DEFAULT_KEYS if key in entries}
-    check_table(default, DEFAULT_KEYS, where)
+    default = {name: entries.pop(name) for name in DEFAULT_KEYS if name in entries}
+    default = check_table(default, DEFAULT_KEYS, where)
     named = {}
     for name, entry in entries.items():
         given = check_table(entry, PRIOR_KEYS, f"{where} {name}")
         normal = given.get("shape", default.get("shape")) != "uniform"
-        inherited = default if normal else {"shape": "uniform"}
+        inherited: Content = default if normal else {"shape": "uniform"}
         with validation.error_context(f"{where} {name}"):
-            named[name] = ParameterPrior(**with_floats({**inherited, **given}, PRIOR_KEYS))
+            named[name] = ParameterPrior(**(inherited | given))
     with validation.error_context(where):
-        return Priors(ParameterPrior(**with_floats(default, PRIOR_KEYS)), named)
+        return Priors(ParameterPrior(**default), named)
 
 
 def priors_to_table(priors: Priors) -> Content:
     """The [prior] table; empty for the default."""
     if priors == Priors():
         return {}
-    tables = {name: _changed(prior) for name, prior in priors.named.items()}
-    return {**_changed(priors.default), **nest(tables)}
-
-
-def _changed(prior: ParameterPrior) -> Content:
-    return {key: value for key, value in dataclasses.asdict(prior).items() if value is not None}
+    tables = {name: vars(prior) for name, prior in priors.named.items()}
+    return {**vars(priors.default), **nest(tables)}
 
 
 def read_start(table: Table, free: Collection[str], where: str) -> Mapping[str, float]:
@@ -398,5 +319,4 @@ def read_start(table: Table, free: Collection[str], where: str) -> Mapping[str, 
         ValueError: a name is not free, or a value is no number.
     """
     values = flatten(table, 2)
-    check_table(values, dict.fromkeys(free, validation.NUMBER), where)
-    return with_floats(values, values)
+    return check_table(values, dict.fromkeys(free, Key(NUMBER, "A value.")), where)

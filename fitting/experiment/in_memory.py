@@ -10,8 +10,10 @@ import numpy as np
 
 import jaxik
 from fitting.clips import Clip, save_clip
-from fitting.ground.meshes import Mesh, mesh_of, save_mesh
+from fitting.clips.load import ClipOptions
+from fitting.ground.meshes import Mesh, TerrainOptions, mesh_of, save_mesh
 from fitting.inference.sensitivity import FreeTable
+from fitting.runtime.declarations import keys
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
@@ -39,11 +41,7 @@ Free: TypeAlias = Choice | Iterable[Choice] | Mapping[Choice, Mapping[str, float
 
 
 PATH = Path("experiment")  # that messages name
-OF_FILES = (
-    "file_up", "joints", "scale", "up", "asf", "animation", "travel", "sole", "terrain_scale",
-    "terrain_offset", "terrain_cell",
-)  # fmt: skip
-"""Keys of a clip that say how its files are read."""
+OF_FILES = {*keys(ClipOptions), *keys(TerrainOptions)}  # say how the files of a clip are read
 
 
 @in_float64
@@ -130,7 +128,7 @@ def free_table(free: Free, ik: jaxik.FootIK) -> FreeTable:
     if isinstance(free, str) or callable(free):
         free = [free]
     entries = free.items() if isinstance(free, Mapping) else ((entry, {}) for entry in free)
-    table = {name: dict(keys) for entry, keys in entries for name in _names(entry, ik)}
+    table = {name: dict(overrides) for entry, overrides in entries for name in _names(entry, ik)}
     if not table:
         raise ValueError("free: names no parameter; wanted one at least")
     return table
@@ -153,7 +151,7 @@ def _names(entry: Choice, ik: jaxik.FootIK) -> list[str]:
 
 
 def clip_entry(
-    reference: Clip, terrain: Terrain, base: Clip | None = None, **keys: Any
+    reference: Clip, terrain: Terrain, base: Clip | None = None, **others: Any
 ) -> ClipEntry:
     """A clip of an experiment, in memory.
 
@@ -162,22 +160,22 @@ def clip_entry(
         terrain: the ground under it.
         base: the flat animation, its legs as in `load_flat_animation` or not; None makes one from
             the reference.
-        keys: others of `ClipEntry`, such as `start`, `end`, `root` or `subject`.
+        others: fields of `ClipEntry`, such as `start`, `end`, `root` or `subject`.
 
     Raises:
         ValueError: a key says how files are read.
     """
-    if unused := [key for key in OF_FILES if key in keys]:
+    if unused := sorted(OF_FILES & others.keys()):
         raise ValueError(f"{unused} say how files are read; a clip in memory has been read")
     loaded = LoadedFiles(reference, terrain, base)
     names = {"reference": Path(reference.source), "terrain": Path("terrain")}
     flat = None if base is None else Path(base.source)
-    return ClipEntry(**names, base=flat, loaded=loaded, **keys)
+    return ClipEntry(**names, base=flat, loaded=loaded, **others)
 
 
 @in_float64
 def make_experiment(
-    *clips: ClipEntry, free: Free, system: jaxik.FootIK | str = DEFAULT_PRESET.name, **keys: Any
+    *clips: ClipEntry, free: Free, system: jaxik.FootIK | str = DEFAULT_PRESET.name, **others: Any
 ) -> Experiment:
     """An experiment, with no file on disk; `fitting.fit` and the other jobs take it as any other.
 
@@ -188,7 +186,7 @@ def make_experiment(
             `scale`.
         system: with any rules; its values are fixed where they are not free. Or the name of a
             preset, for the body of the first clip.
-        keys: others of `Experiment`, such as `name`, `sigmas`, `loss` or `fit`.
+        others: others of `Experiment`, such as `name`, `sigmas`, `loss` or `fit`.
 
     Raises:
         ValueError: there is no clip, a preset or parameter does not exist, or a parameter cannot be
@@ -196,19 +194,19 @@ def make_experiment(
     """
     if not clips:
         raise ValueError("no clip; wanted one at least, made by clip_entry")
-    record_only = keys.pop("record_only", False)
+    record_only = others.pop("record_only", False)
     if isinstance(system, str):
-        named = Preset(system, keys.get("faithful", False))
-        keys |= {"preset": named.name}
+        named = Preset(system, others.get("faithful", False))
+        others |= {"preset": named.name}
         ik = named.system()
     else:
         ik = system
         nearest = _nearest_preset(ik)
-        keys |= {"system": ik, "preset": nearest.name, "faithful": nearest.faithful}
-        keys["parameters"] = own_root(ik, nearest.system()) | keys.get("parameters", {})
+        others |= {"system": ik, "preset": nearest.name, "faithful": nearest.faithful}
+        others["parameters"] = own_root(ik, nearest.system()) | others.get("parameters", {})
     table = free_table(free, ik)
-    keys = {"path": PATH, "name": PATH.name} | keys
-    experiment = Experiment(clips=clips, free=table, **keys)
+    others = {"path": PATH, "name": PATH.name} | others
+    experiment = Experiment(clips=clips, free=table, **others)
     experiment.free_parameters(experiment.starting_system())
     return restrict(experiment) if record_only else experiment
 

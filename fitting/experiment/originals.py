@@ -25,15 +25,17 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import tomli_w
 
 import jaxik
 from fitting.runtime import validation
-from fitting.runtime.validation import TABLE, TEXT, Content, check_keys, check_table
+from fitting.runtime.declarations import NEEDED, key, read
+from fitting.runtime.validation import Content, check_keys
 from jaxik.maths import parameter_tree
 
 from .systems import Preset, changed_rules, with_parameters
@@ -44,8 +46,16 @@ RTOL, ATOL = 1e-6, 1e-9  # within which values are the same
 
 
 COLUMNS = ["system", "setting", "value", "unit"]
-KEYS = {"system": TEXT, "settings": TABLE, "units": TABLE}
 SUFFIXES = (".toml", ".json", ".csv")
+
+
+@dataclass(frozen=True)
+class SettingsFile:
+    """Settings of an original, as a file has them."""
+
+    system: str = key(NEEDED, "The original.")
+    settings: Mapping[str, Any] = key(NEEDED, "By the names of the original.")
+    units: Mapping[str, str] = key({}, "Of those settings that have one.")
 
 
 class Unit(NamedTuple):
@@ -335,15 +345,13 @@ def load_settings(path: Path) -> tuple[jaxik.FootIK, str]:
         raise ValueError(f"{path}: {reason}, wanted a table of settings")
     with validation.error_context(path):
         content = _read(path)
-        check_table(content, KEYS, "a table of settings")
-        if missing := [key for key in ("system", "settings") if key not in content]:
-            raise ValueError(f"no table of settings: there is no {missing[0]}")
-        name, units = content["system"], content.get("units", {})
+        table = read(content, SettingsFile, "a table of settings")
+        name = table.system
         own = {setting.name: setting.unit.name for setting in original_of(name).settings}
-        for setting, unit in units.items():
+        for setting, unit in table.units.items():
             if unit != own.get(setting, unit):
                 raise ValueError(f"{setting} is in {unit!r}; {name} has it in {own[setting]!r}")
-        return to_ik(content["settings"], name), name
+        return to_ik(table.settings, name), name
 
 
 def _read(path: Path) -> Content:

@@ -1,19 +1,9 @@
-"""Parameter files: a system as TOML or JSON, with a preset, changed rules, and one table per stage.
-
-preset = "record"
-faithful = true             # the original, where the preset differs from it
-body = "clip"               # for what is left out: the rig of the clip, or "adult"
-leg_length = 0.84           # m, of the body that all numbers are for, those left out too; with it,
-                            # they change with the legs of the clip as for a similar body
-[rules]                     # where they differ from the preset's
-pelvis = "SupportPelvis"
-[pelvis]                    # names and units as the rules declare them
-lowest_share = 0.4
-"""
+"""Parameter files: a system as TOML or JSON; the README shows one."""
 
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +11,15 @@ import numpy as np
 import tomli_w
 
 import jaxik
+from fitting.runtime.declarations import key, keys, read
 from fitting.runtime.validation import (
     QUOTED,
-    TABLE,
     Content,
     check_keys,
-    check_table,
     error_context,
     flatten,
     in_one_line,
     nest,
-    number,
     read_json,
     read_toml,
     why_unreadable,
@@ -41,8 +29,8 @@ from jaxik.world import body
 from jaxik.world.similarity import similar
 
 from .systems import (
-    BODY,
     DEFAULT_PRESET,
+    Body,
     Preset,
     changed_rules,
     leaf_names,
@@ -50,7 +38,14 @@ from .systems import (
     with_rules,
 )
 
-TOP_KEYS = {"rules": TABLE, "body": BODY, "leg_length": number(0.01, 100.0, "metres")}
+
+@dataclass(frozen=True)
+class ParameterFile:
+    """What a parameter file has beside a table for each stage."""
+
+    rules: Mapping[str, str] = key({}, "Rules that differ from the preset's, by stage.")
+    body: Body | None = key(None, "Whose numbers are meant where the file leaves them out.")
+    leg_length: float | None = key(None, "Of the body that all numbers are for.", "m", 0.01, 100.0)
 
 
 def system_to_toml(
@@ -140,15 +135,14 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
     if not content:  # the defaults would pass for what somebody has fitted
         raise ValueError(f"{path}: nothing is in it; wanted a preset, rules or parameters")
     preset = Preset(content.pop("preset", DEFAULT_PRESET.name), content.pop("faithful", False))
-    top = {key: content.pop(key) for key in TOP_KEYS if key in content}
-    check_table(top, TOP_KEYS, str(path))
-    rules, leg_length = top.get("rules", {}), top.get("leg_length")
-    own = None if top.get("body") == "adult" or leg_length is not None else rig
+    own_keys = {name: content.pop(name) for name in keys(ParameterFile) if name in content}
+    top = read(own_keys, ParameterFile, str(path))
+    own = None if top.body == "adult" or top.leg_length is not None else rig
     with error_context(path):
         ik = preset.system(own)
-    ik = with_rules(ik, rules, f"{path} [rules]", own)
+    ik = with_rules(ik, top.rules, f"{path} [rules]", own)
     check_keys(content, list(vars(ik)), str(path))
     ik = with_parameters(ik, flatten(content, 2), str(path))
-    if leg_length is not None and rig is not None:
-        ik = similar(ik, body.leg_length(rig) / leg_length)
+    if top.leg_length is not None and rig is not None:
+        ik = similar(ik, body.leg_length(rig) / top.leg_length)
     return ik, preset

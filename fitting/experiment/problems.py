@@ -165,14 +165,14 @@ def _load_rig(entry: ClipEntry) -> jaxik.Rig:
 def _load_reference(entry: ClipEntry) -> Clip:
     if entry.loaded is not None:
         return entry.loaded.reference
-    return load_clip(entry.reference, **vars(entry.clip_options.of_file(entry.reference)))
+    return load_clip(entry.reference, **entry.of_file(entry.reference).given)
 
 
 def _load_base(base: Path, entry: ClipEntry) -> Clip:
     if entry.loaded is not None and entry.loaded.base is not None:
         with error_context(base):
             return as_flat_animation(entry.loaded.base)
-    return load_flat_animation(base, options=entry.clip_options.of_file(base))
+    return load_flat_animation(base, options=entry.of_file(base))
 
 
 def load_clip_data(
@@ -196,13 +196,13 @@ def load_clip_data(
     def load_ground(options: TerrainOptions) -> Terrain:
         if entry.loaded is not None:
             return with_floats(entry.loaded.terrain, np.float64)
-        return meshes.load_terrain(entry.terrain, **vars(options))
+        return options.load(entry.terrain)
 
     def check_ground(clip: Clip) -> None:
-        measured = coverage.measure(clip, terrain, entry.terrain_options, load_ground)
+        measured = coverage.measure(clip, terrain, entry, load_ground)
         coverage.require(measured, as_keys=has_file)
 
-    terrain = load_ground(entry.terrain_options)
+    terrain = load_ground(entry)
     if captured is None:
         captured = _load_reference(entry)
     if entry.mask_pops:

@@ -10,36 +10,27 @@ A table such as [parameters] may hold what any rule of a stage has. Which rule a
 from its preset and its [rules], so conditions then allow only the names of that rule.
 """
 
-import dataclasses
 import functools
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple, get_args
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 
 import jaxik
-from fitting.clips.skating import TRAVELS
-from fitting.ground.ground_path import ROOTS
-from fitting.inference.noise import Correlation, NoiseOptions, Sigmas
-from fitting.inference.optimise.solution import SearchSettings
-from fitting.inference.sample.blocks import SamplerSettings
-from fitting.inference.settings import Settings, describe
-from fitting.problem.problem import Loss
-from fitting.problem.scene import LEAST_SIGMAS, WHITENED, Capture
+from fitting.problem.scene import WHITENED, Capture
 from fitting.problem.space import SPREAD
-from fitting.runtime import validation
-from fitting.runtime.validation import NUMBER, Constraint, Content
+from fitting.runtime.declarations import NUMBER, closed, keys, table_schema
+from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 from jaxik.world.arguments import LAYERS
 
-from . import file_tables, systems
-from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
-from .file_tables import PRIOR_KEYS
-from .systems import BODY
+from . import systems
+from .experiment import ALL_SIGMA_KEYS, CORRELATION, FIT_KEYS, SEARCH_KEYS, Experiment
+from .file_tables import DEFAULT_KEYS, PRIOR_KEYS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+TABLES = ("object", "array")
 
 
 LEG = r"(\[\d+\])?"  # after the name of a free parameter: of one leg
@@ -48,92 +39,6 @@ VALUES: dict[str, Content] = {  # of one number, by the kind of its leaf
     "u": {"type": "integer", "minimum": 0, "maximum": 2**LAYERS - 1},
     "f": {"type": ["number", "null"]},  # inf, which is no JSON, may come as null
 }
-
-FILES = {
-    "reference": "The captured motion: a clip. Needed.",
-    "terrain": "The ground under it: a mesh or a heightfield. Needed.",
-    "base": "The flat animation; left out, it is made from the reference.",
-    "truth": "Parameters that made a synthetic reference, for the report.",
-    "tracks": "What changes along the clip: a track file.",
-    "asf": "The skeleton of an .amc, where it is not beside it.",
-}
-FILE_KEYS = tuple(FILES)
-AXIS = validation.one_of(("y", "z"))
-UNITS = validation.number(1e-9, 1e6)
-JOINTS = Constraint(
-    "a file, or a table of joint names by role",
-    lambda value: validation.TEXT.accepts(value) or validation.TABLE.accepts(value),
-    {"anyOf": [validation.TEXT.schema, validation.TABLE.schema]},
-)
-OFFSET = Constraint(
-    "three numbers of metres from -1e+06 to 1e+06",
-    lambda value: (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(validation.is_within(entry, -1e6, 1e6) for entry in value)
-    ),
-    {
-        "type": "array",
-        "items": {"type": "number", "minimum": -1e6, "maximum": 1e6},
-        "minItems": 3,
-        "maxItems": 3,
-    },
-)
-CLIP_KEYS: dict[str, Constraint] = {
-    **{key: validation.TEXT.meaning(f"{doc} The path is relative.") for key, doc in FILES.items()},
-    "label": validation.TEXT.meaning("What plots call the reference."),
-    "subject": validation.TEXT.meaning("Whom the clip shows, for [hierarchy]."),
-    "start": validation.SECONDS.meaning("Where the part of the clip that counts begins.", "s"),
-    "end": validation.SECONDS.meaning("Where it ends; left out, with the clip.", "s"),
-    "joints": JOINTS.meaning("Which joint of reference and base is which: a map of joints."),
-    "scale": UNITS.meaning("Metres per unit of reference and base; left out, guessed."),
-    "up": AXIS.meaning("Up axis of reference and base; left out, guessed."),
-    "animation": validation.TEXT.meaning("Which animation of a .glb or .gltf that has several."),
-    "travel": validation.one_of(TRAVELS).meaning(
-        "Whether the roots of reference and base are moved so that standing feet stay put, or left,"
-        " or moved where the clip is clearly a cycle in place; left out, auto."
-    ),
-    "sole": validation.number(0, 10, "metres").meaning(
-        "Height of the balls of reference and base over their soles; left out, measured or"
-        " estimated.",
-        "m",
-    ),
-    "file_up": AXIS.meaning("Up axis of the terrain's file."),
-    "terrain_scale": UNITS.meaning("Metres per unit of the terrain's file."),
-    "terrain_offset": OFFSET.meaning("By which the terrain is moved.", "m"),
-    "terrain_cell": validation.number(1e-3, 1e4, "metres").meaning(
-        "Between two heights of a terrain whose file does not say it.", "m"
-    ),
-    "mask_pops": validation.BOOLEAN.meaning(
-        "Whether frames in which a captured marker jumps are left out."
-    ),
-    "held_out": validation.BOOLEAN.meaning(
-        "Whether the clip is not fitted, but shows what the fit is worth."
-    ),
-    "root": validation.one_of(ROOTS).meaning(
-        "Where the root is put: where the animation has it, on the ground below it, or on the"
-        " ground only where foot IK does not reach it."
-    ),
-}
-DEVIATION = "Standard deviation of the residuals of"
-SIGMAS = {  # by kind: meaning and unit
-    "ankle": (f"{DEVIATION} ankle positions.", "m"),
-    "knee": (f"{DEVIATION} knee positions.", "m"),
-    "pelvis": (f"{DEVIATION} the pelvis's position.", "m"),
-    "foot": (f"{DEVIATION} the rotation of the ankle joints.", "rad"),
-    "body": (f"{DEVIATION} the rotation of the pelvis.", "rad"),
-    "contact": (f"{DEVIATION} the weight of contact.", ""),
-    "smooth": (f"{DEVIATION} the acceleration of the ankles, which should be 0.", "m/s²"),
-}
-KINDS = tuple(SIGMAS)
-SIGMA_KEYS = {
-    kind: validation.number(LEAST_SIGMAS.get(kind, 1e-9), 1e9, or_inf=True).meaning(
-        f"{doc} Infinity leaves them out.", unit
-    )
-    for kind, (doc, unit) in SIGMAS.items()
-}
-CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
-CORRELATION = validation.CORRELATION.meaning("Correlation of residuals from frame to frame.")
 
 
 def experiment_schema() -> Content:
@@ -148,69 +53,48 @@ def experiment_schema() -> Content:
         "prior": prior(),
         "start": start(),
         "sigmas": _sigmas(),
-        "noise": _made_by(NOISE_KEYS, NoiseOptions),
         "fit": _fit(),
-        "sample": _made_by(SAMPLE_KEYS, SamplerSettings),
-        "hierarchy": _made_by(file_tables.HIERARCHY_KEYS, file_tables.Hierarchy),
-        "clips": _list_of(_made_by(CLIP_KEYS, ClipEntry), ("reference", "terrain"), minItems=1),
     }
-    schema = _with_tables(_made_by(TOP_KEYS, Experiment), tables)
-    references = {name: {"$ref": f"#/properties/{name}"} for name in of_system}
-    variant = _with_tables(named(file_tables.ABLATION_KEYS), references)
-    schema = _with_tables(schema, {"without": _list_of(variant, ("name",))})
-    schema["properties"]["preset"] |= {"enum": systems.preset_names()}
+    schema = table_schema(keys(Experiment))
+    properties = schema["properties"]
+    for name, table in tables.items():
+        properties[name] = {"description": properties[name]["description"], **table}
+    variant = properties["without"]["items"]["properties"]
+    for name in of_system:
+        reference = {"$ref": f"#/properties/{name}"}
+        variant[name] = {"description": variant[name]["description"], **reference}
+    properties["clips"]["minItems"] = 1
+    properties["preset"]["enum"] = systems.preset_names()
+    plain = {name: part for name, part in properties.items() if part.get("type") not in TABLES}
     return {
         "$schema": DIALECT,
         "title": "Experiment of jaxik",
         "description": "What is fitted to what.",
         **schema,
-        "required": ["clips", "free"],
+        "properties": plain | properties,  # tables last, as in files
         "allOf": [only_originals(), *conditions()],
         "$defs": definitions(),
     }
 
 
-def _made_by(constraints: Mapping[str, Constraint], maker: type) -> Content:
-    """The schema of a table of which a dataclass is made, whose defaults are its fields'."""
-    fields = dataclasses.fields(maker)
-    return named(constraints, {f.name: f.default for f in fields if _is_plain(f.default)})
-
-
-def _is_plain(default: object) -> bool:
-    return isinstance(default, bool | int | float | str | tuple) and default not in ("", ())
+def _fit() -> Content:
+    """The table [fit], with that of the search in it."""
+    schema, search = table_schema(FIT_KEYS), table_schema(SEARCH_KEYS)
+    schema["properties"]["search"] |= search
+    return schema
 
 
 def _sigmas() -> Content:
     """The table [sigmas], in which there may be a correlation for each kind."""
-    schema = named(SIGMA_KEYS, DEFAULT_SIGMAS)
-    together = schema["properties"]["correlation"]
-    meaning, default = (together.pop(key) for key in ("description", "default"))
-    names = [name.partition(".")[2] for name in CORRELATIONS]
-    each = closed({name: together for name in names})
-    both = {"anyOf": [together, each], "description": f"{meaning} One for all kinds, or a table."}
-    return schema | {
-        "properties": schema["properties"] | {"correlation": both | {"default": default}}
-    }
-
-
-def _fit() -> Content:
-    schema = _made_by(FIT_KEYS, FitOptions)
-    schema["properties"]["max_steps"]["default"] = SearchSettings().max_steps
-    search = _made_by(SEARCH_KEYS, SearchSettings)
-    return _with_tables(schema, {"search": search})
-
-
-def _with_tables(schema: Content, tables: Mapping[str, Content]) -> Content:
-    """A schema with those of the tables in it, whose meaning it has."""
-    properties = dict(schema["properties"])
-    for name, table in tables.items():
-        meaning = {"description": properties[name]["description"]}
-        properties[name] = table | meaning
-    return schema | {"properties": properties}
-
-
-def _list_of(entry: Content, required: tuple[str, ...], **limits: int) -> Content:
-    return {"type": "array", "items": entry | {"required": list(required)}, **limits}
+    schema = table_schema(ALL_SIGMA_KEYS)
+    declared = schema["properties"]["correlation"]
+    together = dict(CORRELATION.constraint.schema)
+    both = {"anyOf": [together, closed(dict.fromkeys(WHITENED, together))]}
+    text = f"{declared['description']} One for all kinds, or a table."
+    schema["properties"]["correlation"] = {
+        **both, "description": text, "default": declared["default"]
+    }  # fmt: skip
+    return schema
 
 
 class Field(NamedTuple):
@@ -227,8 +111,10 @@ class Field(NamedTuple):
 def definitions() -> Content:
     """What other schemas of this module refer to."""
     return {
-        "free": named(systems.FREE_KEYS),
-        "prior": named(PRIOR_KEYS),
+        "free": table_schema(systems.FREE_KEYS),
+        "prior": table_schema(
+            {name: part._replace(default=None) for name, part in PRIOR_KEYS.items()}
+        ),
         "start": dict(NUMBER.schema),
     }
 
@@ -273,7 +159,7 @@ def start() -> Content:
 
 def prior() -> Content:
     """The schema of [prior]: keys of its own, and tables of parameters, and of captures."""
-    own = {key: dict(PRIOR_KEYS[key].schema) for key in ("shape", "spread")}
+    own = {name: declared.schema for name, declared in DEFAULT_KEYS.items()}
     own["shape"]["default"], own["spread"]["default"] = "normal", SPREAD
     tables = _with_captures("prior")
     return tables | {"properties": own | tables["properties"]}
@@ -431,122 +317,3 @@ def _value_schema(rule: eqx.Module, name: str) -> Content:
     for size in shapes[name]:
         single = {"type": "array", "items": single, "minItems": size, "maxItems": size}
     return {"anyOf": [single, {"type": "array", "items": single, "minItems": 1}]}
-
-
-SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), CORRELATION)
-
-
-def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
-    return {
-        name: Constraint(
-            declared.range, lambda value, declared=declared: declared.allows(value), declared.schema
-        ).meaning(declared.meaning, "" if declared.unit == "1" else declared.unit)
-        for name, declared in describe(settings).items()
-    }
-
-
-FIT_KEYS: dict[str, Constraint] = {
-    "starts": validation.count(1, 1000).meaning(
-        "Independent starts of the search, at most, until enough of them agree."
-    ),
-    "max_steps": _constraints(SearchSettings)["max_steps"],
-    "search": validation.TABLE.meaning("Settings of the search."),
-}
-SEARCH_KEYS = {
-    name: constraint
-    for name, constraint in _constraints(SearchSettings).items()
-    if name != "max_steps"  # which is a key of [fit]
-}
-SAMPLE_KEYS = _constraints(SamplerSettings)
-NOISE_KEYS = {
-    "sigmas": validation.one_of(get_args(Sigmas)).meaning(
-        "Whether the standard deviations are as [sigmas] says, or are estimated from there on,"
-        " which moves the best point: right where a system can follow all but the noise."
-    ),
-    "correlation": validation.one_of(get_args(Correlation)).meaning(
-        "Whether intervals are as wide as size and correlation of the residuals say (counted), or"
-        " as [sigmas] says (given); or the correlation is taken out of the residuals (whitened),"
-        " which moves the best point: right where a system can follow all but the noise."
-    ),
-}
-TABLES = {
-    "free": "What is fitted, if anything; {} takes range, kind and scale from the rule's"
-    " declaration. Needed.",
-    "capture": "What is not known of the captures and fitted beside the system, for each clip.",
-    "prior": "What is known of free parameters before any clip.",
-    "start": "Where the search begins; left out, at the system's values.",
-    "rules": "Rules that differ from the preset's, by stage.",
-    "parameters": "Fixed values that differ from the preset's.",
-    "sigmas": "Standard deviation of each kind of residual.",
-    "noise": "Which properties of the noise are estimated, and what for.",
-    "fit": "How the best fit is searched for.",
-    "sample": "How `jaxik sample` samples the posterior.",
-    "hierarchy": "What several clips and subjects have in common; left out, everything.",
-}
-TOP_KEYS: dict[str, Constraint] = {
-    "name": validation.TEXT.meaning("Title of the experiment; left out, the file's name."),
-    "written_in": validation.TEXT.meaning(
-        "Where the file was written: paths start there that lead nowhere from the file itself, as"
-        " after moving a run alone."
-    ),
-    "preset": validation.TEXT.meaning("The system that is fitted."),
-    "faithful": validation.BOOLEAN.meaning(
-        "Whether the preset is the original, where the preset differs from it."
-    ),
-    "body": BODY.meaning(
-        "Whose numbers and ranges are meant: those of the first clip's body, or of an adult of"
-        " 1.8 m."
-    ),
-    "record_only": validation.BOOLEAN.meaning(
-        "Whether free parameters that the game's record has no room for are left out."
-    ),
-    "loss": validation.one_of(get_args(Loss)).meaning(
-        "How residuals count; all but squares give a few wrong frames less influence. Left out,"
-        " huber; squares where sigmas are estimated."
-    ),
-    "fps": validation.RATE.meaning("Rate to which clips are resampled; left out, none.", "Hz"),
-    "holdout": validation.number(0.0, 0.9).meaning(
-        "Fraction of each clip, its end, that is not fitted but shows what the fit is worth; clips"
-        " of less than 3 s are fitted whole."
-    ),
-    "seed": validation.SEED.meaning("Of all random numbers."),
-    "independent_every": validation.SECONDS.meaning(
-        "Time between residuals that count as independent; at 0 as [noise] says.", "s"
-    ),
-    **{name: validation.TABLE.meaning(doc) for name, doc in TABLES.items()},
-    "clips": validation.list_of("[[clips]], one for each clip").meaning("The clips. Needed."),
-    "without": validation.list_of("[[without]], one for each variant").meaning(
-        "Variants that `jaxik ablate` fits."
-    ),
-}
-
-
-def closed(properties: Mapping[str, Content], patterns: Mapping[str, Content] = {}) -> Content:  # noqa: B006
-    """The schema of a table with these keys and no others.
-
-    Args:
-        properties: schemas of the values, by key.
-        patterns: likewise, by pattern of further keys.
-    """
-    schema = {"type": "object", "properties": properties, "additionalProperties": False}
-    return schema | {"patternProperties": patterns} if patterns else schema
-
-
-def named(
-    constraints: Mapping[str, Constraint], defaults: Mapping[str, object] | None = None
-) -> Content:
-    """The schema of a table with these keys and no others.
-
-    Args:
-        constraints: of the values, by key.
-        defaults: values that keys have where they are left out; None is no value.
-    """
-    properties = {key: dict(constraint.schema) for key, constraint in constraints.items()}
-    for key, default in (defaults or {}).items():
-        if key not in properties or default is None or isinstance(default, Mapping):
-            continue
-        if default == math.inf:  # which JSON does not have
-            properties[key]["description"] += " Default: inf."
-        else:
-            properties[key]["default"] = list(default) if isinstance(default, tuple) else default
-    return closed(properties)

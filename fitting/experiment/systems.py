@@ -3,15 +3,16 @@
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from inspect import signature
-from typing import NamedTuple, TypeVar, get_args
+from typing import Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
 
 import jaxik
 from fitting.inference.sensitivity import FreeTable
-from fitting.runtime import validation
-from fitting.runtime.validation import Table, check_keys, check_table, flatten
+from fitting.problem.space import Override
+from fitting.runtime.declarations import check_table, keys
+from fitting.runtime.validation import Table, check_keys, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world import body
@@ -69,17 +70,10 @@ VALUES: dict[str, tuple[str, Callable[[np.ndarray], bool]]] = {  # of leaves, by
     "u": (f"a whole number from 0 to {2**LAYERS - 1}: a bit for each layer", _are_masks),
     "f": (f"a number of at most {LARGEST:.2g}, or inf", _are_numbers),
 }
-BODY = validation.one_of(("clip", "adult"))  # whose defaults are meant
-FREE_KEYS: dict[str, validation.Constraint] = {
-    "low": validation.NUMBER.meaning("The fit goes no lower; in the parameter's unit."),
-    "high": validation.NUMBER.meaning("The fit goes no higher; in the parameter's unit."),
-    "kind": validation.one_of(get_args(parameter_tree.ParameterKind)).meaning(
-        "A threshold moves a hard decision, so that its derivative is 0."
-    ),
-    "scale": validation.one_of(get_args(parameter_tree.Scale)).meaning(
-        "How the fit steps: evenly, by factors, or as the half-life of a gain."
-    ),
-}
+Body = Literal["clip", "adult"]  # whose defaults are meant
+
+
+FREE_KEYS = keys(Override)
 MOVED_KEYS = {"prior_mean": "centre", "prior_sd": "spread"}  # from [free] to [prior]
 
 
@@ -262,4 +256,5 @@ def read_free_table(table: Table, where: str) -> FreeTable:
                 f"{where} {name}: {old[0]} is no key of [free] any more; write it in the table"
                 f" [prior] of the experiment, as {name} = {{ {moved} }}"
             )
-    return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in named.items()}
+        check_table(entry, FREE_KEYS, f"{where} {name}")
+    return named

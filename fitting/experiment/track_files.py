@@ -1,34 +1,34 @@
-"""Track files: TOML with what changes along a clip, by the states of its animation.
-
-[grounded]                           # 0 in the air, on a seat or on a ladder
-times = [0.0, 1.2, 1.3]              # s, from the start of the clip
-values = [1, 1, 0]                   # linear between the times, the same before and after them
-[weight.left]                        # how much foot IK a leg gets, by its name
-times = [0.0, 2.0]
-values = [1, 0]
-stepped = true                       # each value holds until the next
-[pelvis.limit]                       # any parameter of the system; a list for one value a leg
-times = [0.0, 1.0]
-values = [0.3, 0.05]
-"""
+"""Track files: TOML with what changes along a clip, by its animation; the README shows one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from fitting.clips import Clip
-from fitting.runtime import validation
-from fitting.runtime.validation import LARGEST, Table, check_keys, check_table, read_toml
+from fitting.runtime.declarations import LARGEST, NEEDED, Constraint, key, read
+from fitting.runtime.validation import check_keys, read_toml
 
 GROUNDED, WEIGHT = "grounded", "weight"
 LATEST = 1e6  # s
-KEYS = {
-    "times": validation.list_of("a list of seconds"),
-    "values": validation.list_of("a list with a value for each time"),
-    "stepped": validation.BOOLEAN,
-}
+A_LIST = Constraint("a list", lambda value: isinstance(value, list))
+
+
+@dataclass(frozen=True)
+class TrackTable:
+    """A track as a file has it; its numbers are checked later, all at once."""
+
+    times: Annotated[list, A_LIST] = key(
+        NEEDED, "From the start of the file.", "s", wanted="a list of seconds"
+    )
+    values: Annotated[list, A_LIST] = key(
+        NEEDED,
+        "One for each time, or a list of one for each leg.",
+        wanted="a list with a value for each time",
+    )
+    stepped: bool = key(False, "Whether each value holds until the next.")
 
 
 @dataclass(frozen=True)
@@ -110,27 +110,24 @@ def along(clip: Clip, path: Path | None, start: float = 0.0) -> tuple[Clip, dict
 
 
 def _track(value: object, where: str) -> Track:
-    table: Table = check_table(value, KEYS, where)
-    if missing := sorted({"times", "values"} - set(table)):
-        raise ValueError(f"{where}: there are no {missing[0]}; a track has times and values")
+    table = read(value, TrackTable, where)
     try:
-        times = np.asarray(table["times"], np.float64)
-        values = np.asarray(table["values"], np.float64)
+        times = np.asarray(table.times, np.float64)
+        values = np.asarray(table.values, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{where}: wanted numbers as times and values") from None
     if times.ndim != 1 or not times.size or len(values) != len(times):
         raise ValueError(f"{where}: {len(times)} times and {len(values)} values; wanted as many")
     if not (np.abs(times) <= LATEST).all() or not (np.diff(times) > 0).all():
         raise ValueError(
-            f"{where}: times are {table['times']}; wanted them ascending, to {LATEST:g} s at most"
+            f"{where}: times are {table.times}; wanted them ascending, to {LATEST:g} s at most"
         )
-    stepped = table.get("stepped", False)
     if not values.size or values.ndim > 2:
-        raise ValueError(f"{where}: values are {table['values']}; wanted numbers, or lists of them")
+        raise ValueError(f"{where}: values are {table.values}; wanted numbers, or lists of them")
     allowed = np.abs(values) <= LARGEST
-    if not (allowed | (stepped & (values == np.inf))).all():
+    if not (allowed | (table.stepped & (values == np.inf))).all():
         raise ValueError(
-            f"{where}: values are {table['values']}; wanted numbers of at most {LARGEST:g}, or "
+            f"{where}: values are {table.values}; wanted numbers of at most {LARGEST:g}, or "
             "with stepped = true also inf"
         )
-    return Track(times, values, stepped)
+    return Track(times, values, table.stepped)

@@ -8,7 +8,7 @@ metres, y up.
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64
 
 from fitting.clips import guesses
 from fitting.clips.clip import Clip
+from fitting.runtime.declarations import keys
 from jaxik.world import body
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh
@@ -206,18 +207,18 @@ def _find_remedy(
             return other.options
     grounds.sort(key=lambda each: float(_size(each.terrain)[1]))  # one that stands upright is last
     for terrain, options in grounds:
-        offset, scale = np.array(options.offset), options.scale or 1.0
+        offset, scale = np.array(options.offset), options.terrain_scale or 1.0
         too_small = (_size(terrain) < np.ptp(stances.points, axis=0))[[0, 2]].any()
         for factor in FACTORS if any_unit else ():
             if factor > 1.0 and not too_small:
                 continue
             if stances.moved(offset).scaled(1.0 / factor).moved(-offset).are_over(terrain):
-                return replace(options, scale=scale * factor)
+                return replace(options, terrain_scale=scale * factor)
     for terrain, options in grounds:
         moved = _offset_to(terrain, stances)
         if moved is not None and stances.moved(moved).are_over(terrain):
             x, y, z = (float(value) + 0.0 for value in np.round(options.offset + moved, 2))
-            return replace(options, offset=(x, y, z))
+            return replace(options, terrain_offset=(x, y, z))
     return None
 
 
@@ -287,11 +288,9 @@ def _changes(
     changes = []
     if clip_scale is not None:
         changes.append(f"scale = {clip_scale:.10g}" if as_keys else f"--scale {clip_scale:.10g}")
-    for field in fields(TerrainOptions):
-        value = getattr(new, field.name)
-        if value == getattr(old, field.name):
+    for name in keys(TerrainOptions):
+        if (value := getattr(new, name)) == getattr(old, name):
             continue
-        name = field.name if field.name == "file_up" else f"terrain_{field.name}"
         numbers = [f"{number:.10g}" for number in np.atleast_1d(value)] if name != "file_up" else []
         if as_keys:
             text = repr(value).replace("'", '"') if not numbers else ", ".join(numbers)

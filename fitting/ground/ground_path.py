@@ -7,6 +7,7 @@ nothing. Distances are for an adult; others' are as their legs.
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,8 @@ from fitting.clips.clip_frames import raised
 from jaxik.world import body
 from jaxik.world.terrain import HORIZON, Terrain, cast
 
-ROOTS = ("auto", "animation", "ground")
+Root = Literal["auto", "animation", "ground"]
+ROOTS = get_args(Root)
 STEP = 1.0  # m: ground further above or below the last one is a ceiling, or has to be fallen to
 FALL = 2.0  # m/s, towards ground further below; a gap is crossed before its bottom counts
 GROUND = 0.5  # fraction of a path with ground below it, from which it is a path over it

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +33,7 @@ from trimesh.exchange.load import mesh_formats
 from trimesh.resolvers import FilePathResolver
 
 from fitting.clips.formats import gltf, npz
+from fitting.runtime.declarations import key
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import surfaces, terrain
 from jaxik.world.heightfield import Heightfield
@@ -62,21 +63,28 @@ MOST_PIXELS = 2**26
 MOST_PACKED = 1040  # bytes of a picture for each of its file: deflate reaches 1032
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TerrainOptions:
-    """How the numbers of a terrain's file become metres with y up.
+    """How the numbers of a terrain's file become metres with y up; without any, it has both."""
 
-    The fields are arguments of `load_terrain`: `load_terrain(path, **vars(options))`.
-    """
+    file_up: Literal["y", "z"] = key("y", "Up axis of the terrain's file.")
+    terrain_scale: float | None = key(None, "Metres per unit of the terrain's file.", "", 1e-9, 1e6)
+    terrain_offset: tuple[float, float, float] | None = key(
+        None, "By which the terrain is moved.", "m", -1e6, 1e6
+    )
+    terrain_cell: float | None = key(
+        None, "Between two heights of a terrain whose file does not say it.", "m", 1e-3, 1e4
+    )
 
-    file_up: str = "y"
-    """Up axis of a mesh's file, "y" or "z"."""
-    scale: float | None = None
-    """Metres per unit of the file, or per level of a picture; None is 1, but for a picture."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """m, world space, by which the terrain is then moved."""
-    cell: float | None = None
-    """m, between neighbours of a heightfield whose file does not say it."""
+    @property
+    def offset(self) -> tuple[float, float, float]:
+        """m, by which the terrain is moved."""
+        return self.terrain_offset or (0.0, 0.0, 0.0)
+
+    def load(self, path: Path) -> Terrain:
+        """The terrain of a file; errors are those of `load_terrain`."""
+        up, scale, cell = self.file_up, self.terrain_scale, self.terrain_cell
+        return load_terrain(path, file_up=up, scale=scale, offset=self.offset, cell=cell)
 
 
 AS_IS = TerrainOptions()

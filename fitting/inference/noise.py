@@ -14,7 +14,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from fitting.problem.scene import LEAST_SIGMAS, MEASURED, WHITENED, Scene
 from fitting.problem.shared_world import run_scenes
 from fitting.problem.space import Vector
 from fitting.runtime import activity
+from fitting.runtime.declarations import Table, key
 from fitting.runtime.json_files import FORMERLY
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
@@ -63,7 +64,7 @@ JOINT_TOLERANCE = (
 
 
 @dataclasses.dataclass(frozen=True)
-class NoiseOptions:
+class NoiseOptions(Table):
     """Which properties of the noise are estimated from the residuals, kind by kind.
 
     By default the best point is where the residuals in units of the given sigmas are smallest, and
@@ -76,15 +77,17 @@ class NoiseOptions:
         ValueError: for an unknown word.
     """
 
-    sigmas: Sigmas = "given"
-    correlation: Correlation = "counted"
-    """Estimated, and residuals counted as fewer, or more, as their correlation and their size say;
-    or estimated and taken out of the residuals (whitened)."""
-
-    def __post_init__(self) -> None:
-        for name, words in (("sigmas", Sigmas), ("correlation", Correlation)):
-            if (word := getattr(self, name)) not in get_args(words):
-                raise ValueError(f"{name} is {word!r}; wanted one of {list(get_args(words))}")
+    sigmas: Sigmas = key(
+        "given",
+        "Whether the standard deviations are as [sigmas] says, or are estimated from there on,"
+        " which moves the best point: right where a system can follow all but the noise.",
+    )
+    correlation: Correlation = key(
+        "counted",
+        "Whether intervals are as wide as size and correlation of the residuals say (counted), or"
+        " as [sigmas] says (given); or the correlation is taken out of the residuals (whitened),"
+        " which moves the best point: right where a system can follow all but the noise.",
+    )
 
     @property
     def moves_optimum(self) -> bool:

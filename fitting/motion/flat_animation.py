@@ -124,7 +124,7 @@ def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = A
         options.check_use([path], str(path))
         clip = read_base(path)
     else:
-        clip = load_clip(path, **vars(options))
+        clip = load_clip(path, **options.given)
     with error_context(path):
         return as_flat_animation(clip, floor, options.sole)
 

@@ -30,7 +30,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import Any, Generic, Literal, TypeAlias, TypeVar, cast, get_args
+from typing import Any, Generic, Literal, TypeAlias, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -40,6 +40,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 from scipy import special
 
+from fitting.runtime.declarations import Table, check_table, key, keys
 from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree, smoothing
 from jaxik.world.body import scaled_declarations
@@ -49,13 +50,11 @@ DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (1e-
 NARROWEST, WIDEST = 1e-6, 1e6  # of a range, times the one that the rule declares
 LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
-OVERRIDES = ("low", "high", "kind", "scale")
 
 Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
 Shape = Literal["normal", "uniform"]
 
 SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
-SPREADS = (1e-3, 1e3)  # of u: from almost known to almost all at the bounds
 LOGISTIC_SD = math.pi / math.sqrt(3)  # of the logistic distribution
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
@@ -70,6 +69,20 @@ Vector: TypeAlias = Float[Array | np.ndarray, " free"]
 Rows = TypeVar("Rows", bound=Float[Array | np.ndarray, "*rows free"])
 
 MIXTURE = 200  # draws of the others, where a parameter stays above another free one
+
+
+@dataclasses.dataclass(frozen=True)
+class Override:
+    """What a table [free] says of a parameter otherwise than its rule does."""
+
+    low: float | None = key(None, "The fit goes no lower; in the parameter's unit.")
+    high: float | None = key(None, "The fit goes no higher; in the parameter's unit.")
+    kind: parameter_tree.ParameterKind | None = key(
+        None, "A threshold moves a hard decision, so that its derivative is 0."
+    )
+    scale: parameter_tree.Scale | None = key(
+        None, "How the fit steps: evenly, by factors, or as the half-life of a gain."
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,22 +134,12 @@ def free_parameter(
         nearest = difflib.get_close_matches(leaf, declared, n=1, cutoff=0.0)
         hint = f"; nearest is {nearest[0]!r}" if nearest else ""
         raise ValueError(f"no parameter named {leaf!r}{hint}; there are {sorted(declared)}")
-    if unknown := sorted(set(overrides) - set(OVERRIDES)):
-        raise ValueError(f"{name}: unknown {unknown}; a free parameter takes {sorted(OVERRIDES)}")
     declaration = declared[leaf]
-    kind = overrides.get("kind", declaration.kind)
-    scale = overrides.get("scale", declaration.scale)
-    _check_choice(name, "kind", kind, get_args(parameter_tree.ParameterKind))
-    _check_choice(name, "scale", scale, get_args(parameter_tree.Scale))
+    bounds = {"low": float(declaration.low), "high": float(declaration.high)}
+    usual = bounds | {"kind": declaration.kind, "scale": declaration.scale}
+    values: Any = usual | check_table(overrides, keys(Override), name)
     present_value(ik, name)  # raises for a leg that does not exist
-    parameter = FreeParameter(
-        name=name,
-        low=float(overrides.get("low", declaration.low)),
-        high=float(overrides.get("high", declaration.high)),
-        kind=cast(parameter_tree.ParameterKind, kind),
-        scale=cast(parameter_tree.Scale, scale),
-        above=_absolute(declaration.above, leaf),
-    )
+    parameter = FreeParameter(name=name, above=_absolute(declaration.above, leaf), **values)
     _check(parameter, declaration)
     return parameter
 
@@ -181,11 +184,6 @@ def _absolute(above: str | None, leaf: str) -> str | None:
     if above is None or "." not in leaf:
         return above
     return f"{leaf.rpartition('.')[0]}.{above}"
-
-
-def _check_choice(name: str, key: str, value: float | str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}: {key} is {value!r}, wanted one of {choices}")
 
 
 def _check(parameter: FreeParameter, declaration: parameter_tree.Declaration) -> None:
@@ -277,29 +275,29 @@ def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
 
 
 @dataclasses.dataclass(frozen=True)
-class ParameterPrior:
+class ParameterPrior(Table):
     """The prior of one parameter, as an experiment states it.
 
     Raises:
-        ValueError: for an unknown shape, a spread outside `SPREADS`, or a uniform
-            prior with a centre or a spread.
+        ValueError: for an unknown shape, a spread out of its range, or a uniform prior with a
+            centre or a spread.
     """
 
-    shape: Shape = "normal"
-    centre: float | None = None
-    """Median of a normal prior, in the parameter's unit; None is the system's value."""
-    spread: float | None = None
-    """Standard deviation of a normal prior, in u; None is `SPREAD`."""
+    shape: Shape = key(
+        "normal",
+        "Distribution of u, the free parameter on its scale; a uniform one has no centre and no"
+        " spread.",
+    )
+    centre: float | None = key(
+        None, "Median, in the parameter's unit; left out, the system's value."
+    )
+    spread: float | None = key(None, "Standard deviation of u.", "", 1e-3, 1e3)
 
     def __post_init__(self) -> None:
-        if self.shape not in get_args(Shape):
-            raise ValueError(f"shape is {self.shape!r}, wanted one of {get_args(Shape)}")
+        super().__post_init__()
         for name in ("centre", "spread"):
             if self.shape == "uniform" and getattr(self, name) is not None:
                 raise ValueError(f"{name} is given, but a uniform prior has none: it is the range")
-        low, high = SPREADS
-        if self.spread is not None and not low <= self.spread <= high:
-            raise ValueError(f"spread is {self.spread}, wanted a number from {low:g} to {high:g}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,10 +3,8 @@
 A file without a version is one of a release before there were versions. What it has is checked in
 the same way; what it must have, its kind says.
 
-Values that a file held, checked against the type that a `TypedDict` or a dataclass declares.
-
-The declaration says what is written; here it also says what is accepted when it is read again.
-`Annotated[float, constraint]` narrows a type by a `Constraint` of `runtime.validation`;
+The `TypedDict` or dataclass that declares what is written also says what is accepted when it is
+read again. `Annotated[float, constraint]` narrows a type by a `Constraint`;
 `Annotated[Content, SomeClass]` is a table with the fields of a dataclass, and no others; a field
 may have metadata that say by which name earlier releases wrote it.
 """
@@ -33,7 +31,8 @@ from typing import (
 )
 
 from . import files
-from .validation import Constraint, Table, in_one_line, read_json
+from .declarations import BOOLEAN, Constraint, one_of
+from .validation import Table, in_one_line, read_json
 
 FORMAT = "format"  # key of the version
 Stored = TypeVar("Stored")
@@ -41,7 +40,17 @@ Stored = TypeVar("Stored")
 FORMERLY = "formerly"  # in the metadata of a field: its name in earlier releases
 LARGEST = 1e300  # of whole numbers that are read as floats
 Finite: TypeAlias = Annotated[float, Constraint("a finite number", lambda x: abs(x) < math.inf)]
-PLAIN = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
+PLAIN = {
+    str: Constraint("a text", lambda value: isinstance(value, str)),
+    bool: BOOLEAN,
+    int: Constraint("a whole number", lambda value: type(value) is int),
+    float: Constraint(
+        "a number",
+        lambda value: type(value) is float or type(value) is int and abs(value) < LARGEST,
+        convert=float,
+    ),
+    types.NoneType: Constraint("null", lambda value: value is None),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,11 +127,6 @@ def check_version(path: Path, version: object, newest: int) -> None:
         )
 
 
-def between(low: int | float, high: int | float) -> Constraint:
-    """Numbers from one to another."""
-    return Constraint(f"a number from {low:g} to {high:g}", lambda x: low <= x <= high)
-
-
 def length(count: int) -> Constraint:
     """Lists of so many elements."""
     return Constraint(f"a list of {count}", lambda elements: len(elements) == count)
@@ -158,15 +162,12 @@ class _Check:
             return self.check(value, arguments[0], where)
         if origin in (Union, types.UnionType):
             return self._any_of(value, arguments, where)
-        if origin is Literal:
-            return _wanted(value in arguments, value, f"one of {list(arguments)}", where)
         if is_typeddict(declared) or dataclasses.is_dataclass(declared):
             return self._table(value, declared, where)
-        if declared is None or declared is types.NoneType:
-            return _wanted(value is None, value, "null", where)
-        if declared in PLAIN:
-            return self._plain(value, declared, where)
-        return self._collection(value, origin or declared, arguments, where)
+        plain = one_of(arguments) if origin is Literal else PLAIN.get(declared)
+        if plain is None:
+            return self._collection(value, origin or declared, arguments, where)
+        return plain.convert(_wanted(plain.accepts(value), value, plain.description, where))
 
     def _constrained(self, value: Any, declared: Any, constraints: tuple, where: str) -> Any:
         value = self.check(value, declared, where)
@@ -185,13 +186,6 @@ class _Check:
             except ValueError as error:
                 problems.append(str(error))
         raise ValueError(problems[0])
-
-    def _plain(self, value: Any, declared: type, where: str) -> Any:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if declared is float and is_number and (isinstance(value, float) or abs(value) < LARGEST):
-            return float(value)
-        fits = isinstance(value, declared) and isinstance(value, bool) == (declared is bool)
-        return _wanted(fits and declared is not float, value, PLAIN[declared], where)
 
     def _table(self, value: Any, declared: Any, where: str) -> Any:
         _wanted(isinstance(value, Mapping), value, "a table", where)

@@ -1,14 +1,11 @@
-"""Checks on files that users write: known keys, and values of the right type and range."""
+"""Files that users write: reading them, their keys, and errors in one line."""
 
-import dataclasses
 import difflib
 import json
-import math
 import os
 import stat
-import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,95 +13,7 @@ from typing import Any, TypeAlias
 Content: TypeAlias = dict[str, Any]  # tables as TOML or JSON reads them, not yet checked
 Table: TypeAlias = Mapping[str, Any]  # the same, to read only
 
-LONGEST_TEXT = 1000
-LARGEST = 3.4e38  # that 32 bits hold
-# JSON has no infinity: some validators read inf as a number above all others, Taplo as null.
-INFINITE = ({"type": "number", "exclusiveMinimum": sys.float_info.max}, {"type": "null"})
 QUOTED = 200  # characters of the error of another library, in a sentence of ours
-
-
-@dataclasses.dataclass(frozen=True)
-class Constraint:
-    """What a value must be: in words for error messages, as a test, and as JSON Schema."""
-
-    description: str
-    accepts: Callable[[Any], bool]
-    schema: Table = dataclasses.field(default_factory=dict, compare=False)
-    """As much of it as JSON Schema can say: what that allows may still be refused."""
-
-    def meaning(self, doc: str, unit: str = "") -> "Constraint":
-        """The constraint of a key with this meaning: a sentence, and the unit of its value."""
-        description = f"{doc} Unit: {unit}." if unit else doc
-        return dataclasses.replace(self, schema={**self.schema, "description": description})
-
-
-def is_within(value: object, low: int | float, high: int | float, *, whole: bool = False) -> bool:
-    """Whether it is a number in this range, and with `whole` one without a fraction."""
-    kinds = int if whole else (int, float)
-    return isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high
-
-
-def number(
-    low: int | float, high: int | float, unit: str = "", *, or_inf: bool = False
-) -> Constraint:
-    """A number in a range, or with `or_inf` infinity as well."""
-    words = f"a number{' of ' if unit else ''}{unit} from {low:g} to {high:g}"
-    schema = {"type": "number", "minimum": low, "maximum": high}
-    return Constraint(
-        f"{words}, or inf" if or_inf else words,
-        lambda value: is_within(value, low, high) or (or_inf and value == math.inf),
-        {"anyOf": [schema, *INFINITE]} if or_inf else schema,
-    )
-
-
-def count(low: int, high: int) -> Constraint:
-    """A whole number in a range."""
-    return Constraint(
-        f"a whole number from {low} to {high}",
-        lambda value: is_within(value, low, high, whole=True),
-        {"type": "integer", "minimum": low, "maximum": high},
-    )
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and value.isprintable() and len(value) <= LONGEST_TEXT
-
-
-TEXT = Constraint(
-    f"a text of at most {LONGEST_TEXT} printable characters",
-    _is_text,
-    {"type": "string", "maxLength": LONGEST_TEXT, "pattern": "^[^\\u0000-\\u001f\\u007f]*$"},
-)
-BOOLEAN = Constraint("true or false", lambda value: isinstance(value, bool), {"type": "boolean"})
-TABLE = Constraint("a table", lambda value: isinstance(value, Mapping), {"type": "object"})
-NUMBER = Constraint(
-    "a finite number",
-    lambda value: is_within(value, -LARGEST, LARGEST),
-    {"type": "number", "minimum": -LARGEST, "maximum": LARGEST},
-)
-SECONDS = number(0, 1e6, "seconds")
-RATE = number(1, 1000, "Hz")
-CORRELATION = number(0, 0.999)
-SEED = count(0, 2**32 - 1)
-
-
-def one_of(words: Sequence[str]) -> Constraint:
-    """Any of these texts."""
-    return Constraint(f"one of {list(words)}", lambda value: value in words, {"enum": list(words)})
-
-
-def list_of(description: str) -> Constraint:
-    """A list, described in these words; its elements are checked elsewhere."""
-    return Constraint(description, lambda value: isinstance(value, list), {"type": "array"})
-
-
-def list_of_texts(description: str) -> Constraint:
-    """A list of texts, described in these words."""
-    return Constraint(
-        description,
-        lambda value: isinstance(value, list) and all(map(_is_text, value)),
-        {"type": "array", "items": TEXT.schema},
-    )
 
 
 def read_toml(path: Path, description: str) -> Content:
@@ -200,34 +109,6 @@ def check_keys(table: Table, known: Sequence[str], where: str) -> None:
             raise ValueError(
                 f"{where}: unknown key {key!r}; nearest is {nearest!r} of {list(known)}"
             )
-
-
-def check_table(value: object, constraints: Mapping[str, Constraint], where: str) -> Table:
-    """Returns the value if it is a table with these keys, each value meeting its constraint.
-
-    Args:
-        value: what was read.
-        constraints: what the value under each known key must be; any key may be absent.
-        where: the table's place in its file, for the error message.
-
-    Raises:
-        ValueError: it is no table, or has an unknown key or a value that is not accepted.
-    """
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{where} is {value!r}; wanted a table, such as {{}}")
-    check_keys(value, list(constraints), where)
-    for key, entry in value.items():
-        if not constraints[key].accepts(entry):
-            raise ValueError(f"{where}: {key} is {entry!r}; wanted {constraints[key].description}")
-    return value
-
-
-def with_floats(table: Table, keys: Iterable[str]) -> Content:
-    """The table with whole numbers under these keys as floats, as code expects them."""
-    return {
-        key: float(value) if key in keys and type(value) is int else value
-        for key, value in table.items()
-    }
 
 
 def flatten(tables: Table, depth: int, prefix: str = "") -> Content:

@@ -32,8 +32,8 @@ from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
 from fitting.ground import coverage
 from fitting.ground.coverage import Coverage
-from fitting.ground.ground_path import AS_ANIMATED, RootChoice, place_root
-from fitting.ground.meshes import TerrainOptions, load_terrain
+from fitting.ground.ground_path import AS_ANIMATED, Root, RootChoice, place_root
+from fitting.ground.meshes import TerrainOptions
 from fitting.motion import measures
 from fitting.motion.flat_animation import (
     load_flat_animation,
@@ -71,7 +71,7 @@ class AnimationFiles:
     terrain: Path
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
-    root: str = "auto"
+    root: Root = "auto"
     """Where the root is put; see `place_root`."""
     speed: float = 1.0
     """Of the root, as a multiple of the clip's; strides are scaled alike."""
@@ -94,7 +94,7 @@ class AnimationFiles:
 
     def load_terrain_in(self, unit: float) -> Terrain:
         """The terrain of the file in another unit, m."""
-        return self._load_terrain(replace(self.terrain_options, scale=unit))
+        return self._load_terrain(replace(self.terrain_options, terrain_scale=unit))
 
     def coverage(self, terrain: Terrain) -> Coverage:
         """How much of it is under the feet of the clip."""
@@ -103,7 +103,7 @@ class AnimationFiles:
         )
 
     def _load_terrain(self, options: TerrainOptions) -> Terrain:
-        return load_terrain(self.terrain, **vars(options))
+        return options.load(self.terrain)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Animation:
         if not motion.measures.misplaced:
             return None
         animated, files = self.placed_clip, self.files
-        unit = 1.0 if files is None else files.terrain_options.scale or 1.0
+        unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
         soles = self._soles(animated)
         return likely_cause(soles, animated, unit=unit, trial=self._soles_without)
 

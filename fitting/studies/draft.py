@@ -193,10 +193,7 @@ class DraftRequest:
         Raises:
             ValueError: as `load_clip`, or a clip has no legs.
         """
-        clips = [
-            load_clip(path, **vars(self.reading.of_file(path)))  # type: ignore[arg-type]
-            for path in self.clips
-        ]
+        clips = [load_clip(path, **self.reading.of_file(path).given) for path in self.clips]
         for clip in clips:
             clip.rig  # noqa: B018  # raises without legs
         return clips
@@ -388,13 +385,14 @@ def _entry(request: DraftRequest, clip: Clip, index: int, ground: Ground | None)
         terrain = request.terrains[index if len(request.terrains) > 1 else 0]
         laid = request.terrain_reading
     return ClipEntry(
-        reference=path.resolve(),
-        terrain=terrain.resolve(),
-        base=None if base is None else base.resolve(),
+        reference=path,
+        terrain=terrain,
+        base=base,
         start=start,
         end=end,
-        **ClipEntry.reading(taken, laid),
-    )
+        **vars(taken),
+        **vars(laid),
+    ).with_paths(Path.resolve)
 
 
 def _motion(clip: Clip) -> tuple[float, float | None]:

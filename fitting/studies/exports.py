@@ -12,9 +12,10 @@ from typing import NamedTuple
 import fitting
 import jaxik
 from fitting.experiment import originals, parameter_files, record_files
-from fitting.experiment.schema import FILE_KEYS
+from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.systems import Preset
 from fitting.runtime import files
+from fitting.runtime.declarations import PATH, keys
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import check_keys, error_context
 from jaxik import record
@@ -172,5 +173,6 @@ def _folder() -> Path:
 
 def _sources(path: Path, content: dict) -> dict[str, Path]:
     """The files that an experiment names, by how it writes their paths."""
-    relative = [clip[key] for clip in content["clips"] for key in FILE_KEYS if key in clip]
+    known = [name for name, declared in keys(ClipEntry).items() if declared.constraint is PATH]
+    relative = [clip[name] for clip in content["clips"] for name in known if name in clip]
     return {name: Path(os.path.normpath(path.parent / name)) for name in relative}

@@ -43,6 +43,7 @@ from fitting.report.document import Block, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import DIFFERENCES, Table, number, percent
 from fitting.report.style import AFTER, BEFORE, EARTH, legend, styled
 from fitting.runtime import activity, files, validation
+from fitting.runtime.declarations import TABLE, Key, check_table
 from fitting.runtime.json_files import write_json
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
@@ -155,7 +156,7 @@ def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Free
     if path.suffix.lower() == ".toml":
         content = validation.read_toml(path, "a free-parameter")
         _check_no_noise(content, text)
-        validation.check_table(content, {"free": validation.TABLE}, text)
+        check_table(content, {"free": Key(TABLE, "What is fitted.")}, text)
         free = systems.read_free_table(content.get("free", {}), f"{text} [free]")
     else:
         free = {name.strip(): {} for name in text.split(",") if name.strip()}
@@ -234,14 +235,15 @@ def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ..
     return tuple(
         ClipEntry(
             reference=run / (f"source_{number}.npz" if count > 1 else "source.npz"),
-            terrain=animation.terrain.resolve(),
-            base=animation.clip.resolve(),
+            terrain=animation.terrain,
+            base=animation.clip,
             truth=run / SOURCE if same_rules else None,
-            **ClipEntry.reading(animation.clip_options, animation.terrain_options),
+            **vars(animation.clip_options),
+            **vars(animation.terrain_options),
             label=f"source: {source.name}",
             mask_pops=False,
             root=animation.root,
-        )
+        ).with_paths(Path.resolve)
         for number, animation in enumerate(request.animations, 1)
     )
 

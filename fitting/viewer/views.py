@@ -132,7 +132,11 @@ class FitWatch(activity.Watcher):
         """Opens the page once the clips are loaded; then shows the best point, now and then."""
         if isinstance(result, LoadedExperiment):
             self._problem = result.problem
-            page = opened(viewer.subject_of_fit(result.experiment, result.problem, result.clips), self.folder, self.address)
+            page = opened(
+                viewer.subject_of_fit(result.experiment, result.problem, result.clips),
+                self.folder,
+                self.address,
+            )
             self.viewer = self._page.enter_context(page)
         elif isinstance(result, Report) and self._problem is not None:
             self._show(result, self._problem)

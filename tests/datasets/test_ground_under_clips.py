@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fitting.clips.summary import as_text, describe
 from fitting.experiment import experiment_files, problems
 from fitting.ground import coverage, ground_path
 from fitting.ground.coverage import GroundWarning
-from fitting.ground.meshes import AS_IS, TerrainOptions, load_terrain, save_mesh
+from fitting.ground.meshes import AS_IS, TerrainOptions, save_mesh
 from fitting.motion import flat_animation
 from fitting.motion.flat_animation import flatten_clip, load_flat_animation, with_rigid_legs
 from fitting.studies.animations import AnimationFiles, load_animation
@@ -382,7 +383,7 @@ def covered(route, tmp_path):
         save_mesh(tmp_path / "hill.obj", vertices, hill().faces if faces is None else faces)
 
         def load(options: TerrainOptions) -> terrain.Terrain:
-            return load_terrain(tmp_path / "hill.obj", **vars(options))
+            return options.load(tmp_path / "hill.obj")
 
         measured = coverage.measure(route, load(options), options, load)
         remedy = measured.remedy
@@ -401,7 +402,7 @@ def test_the_other_axis_and_other_units_are_named(covered):
         (z_up, AS_IS, "--file-up z"),
         (lambda v: v, TerrainOptions(file_up="z"), "--file-up y"),
         (lambda v: v / 100, AS_IS, "--terrain-scale 100"),
-        (lambda v: 100 * v, TerrainOptions(scale=0.0001), "--terrain-scale 0.01"),
+        (lambda v: 100 * v, TerrainOptions(terrain_scale=0.0001), "--terrain-scale 0.01"),
         (lambda v: (v * [1, 1, 0.3] + [0, 0, 1]) / 0.0254, AS_IS, "--terrain-scale 0.0254"),
         (lambda v: (v + [0, 0, 2.1]) * 100, AS_IS, "--terrain-scale 0.01"),
         (
@@ -446,7 +447,7 @@ def test_a_terrain_far_away_or_aside_is_moved_below_the_feet(covered):
     assert measured.text(as_keys=True).endswith(in_keys)
     # After it is laid down, and from an offset that is given.
     upright = z_up(hill().vertices + [500.0, 0.0, 0.0])
-    aside = TerrainOptions(offset=(300.0, 0.0, 0.0))
+    aside = TerrainOptions(terrain_offset=(300.0, 0.0, 0.0))
     cases = (upright, AS_IS, "z", -500.0), (hill().vertices, aside, "y", 0.0)
     for vertices, options, file_up, moved in cases:
         remedy = covered(vertices, options).remedy
@@ -480,7 +481,7 @@ def test_a_terrain_in_place_or_below_no_or_a_part_of_the_path_has_no_remedy(cove
 
 
 def test_a_cause_of_misplaced_feet_is_named_only_where_its_remedy_helps(route, tmp_path):
-    def cause_of(clip: Clip, ground: str, root: str, **options) -> tuple[str, float]:
+    def cause_of(clip: Clip, ground: str, root: Any, **options) -> tuple[str, float]:
         save_clip(tmp_path / "walk.npz", clip)
         files = AnimationFiles(
             tmp_path / "walk.npz", tmp_path / ground, root=root,
@@ -501,7 +502,7 @@ def test_a_cause_of_misplaced_feet_is_named_only_where_its_remedy_helps(route, t
     save_mesh(tmp_path / "hill.obj", hill().vertices, hill().faces)
     climbed = np.interp(route.positions_ws[:, route.rig.pelvis, 2], z, heights)
     climber = raised(route, 0.3048 * climbed)
-    place = {"offset": (-3.0, 0.0, -2.0), "cell": 0.1, "scale": 2.0}
+    place = {"terrain_offset": (-3.0, 0.0, -2.0), "terrain_cell": 0.1, "terrain_scale": 2.0}
     assert cause_of(climber, "hill.npy", "animation", **place) == ("units", 0.6096)
     assert cause_of(climber, "hill.obj", "animation")[0] != "units"
 

@@ -222,7 +222,7 @@ def test_a_wrong_track_file_and_a_free_parameter_on_a_track_are_refused(clip, tm
         ("[grounded]\ntimes=[0, 1]\nvalues=[1]", "2 times and 1 values; wanted as many"),
         ("[grounded]\ntimes=[1, 0]\nvalues=[1, 1]", "wanted them ascending"),
         ("[grounded]\ntime=[1, 0]\nvalues=[1, 1]", "unknown key 'time'; nearest is 'times'"),
-        ("[grounded]\ntimes=[1]", "there are no values"),
+        ("[grounded]\ntimes=[1]", "values is missing; it needs times and values"),
         ("grounded = 1", r"\[grounded\] is 1; wanted a table"),
         ("[pelvis.limit]\ntimes=['a']\nvalues=[1]", "wanted numbers"),
     ):

@@ -236,7 +236,7 @@ def test_a_wrong_table_of_settings_costs_one_sentence(tmp_path):
         (f'{unreal}m_IKTraceDistance = "x"\n', "wanted a number"),
         (f"{unreal}m_IKTraceDistance = [1.0, 2.0]\n", "wanted ()"),
         ('system = "mec"\n[settings]\n"Plant Foot" = 1\n', "wanted true or false"),
-        ('[settings]\n"Plant Foot" = true\n', "there is no system"),
+        ('[settings]\n"Plant Foot" = true\n', "system is missing"),
         (f'{unreal}[units]\nm_IKTraceDistance = "m"\n', "has it in 'cm'"),
     ):
         path.write_text(text)

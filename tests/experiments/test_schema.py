@@ -13,30 +13,39 @@ from typing import Any
 import jsonschema
 import pytest
 
-from fitting.experiment import experiment_files, file_tables, parameter_files, systems
-from fitting.experiment import schema as schema_module
-from fitting.experiment.schema import experiment_schema, named
+from fitting.experiment import experiment, experiment_files, parameter_files, systems
+from fitting.experiment.experiment import (
+    ALL_SIGMA_KEYS,
+    FIT_KEYS,
+    SEARCH_KEYS,
+    ClipEntry,
+    Experiment,
+)
+from fitting.experiment.file_tables import Ablation, Hierarchy
+from fitting.experiment.schema import experiment_schema
+from fitting.inference.noise import NoiseOptions
 from fitting.inference.optimise.solution import SearchSettings
 from fitting.inference.sample.blocks import SamplerSettings
-from fitting.inference.settings import describe
 from fitting.problem.scene import LEAST_SIGMAS
+from fitting.problem.space import Override, ParameterPrior
 from fitting.runtime import validation
-from fitting.runtime.validation import Constraint, Content
+from fitting.runtime.declarations import Key, keys, table_schema
+from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, ROOT, text, write
 
-KEYS: dict[str, Mapping[str, Constraint]] = {
-    "top": experiment_files.TOP_KEYS,
-    "clips": schema_module.CLIP_KEYS,
-    "sigmas": experiment_files.SIGMA_KEYS,
-    "fit": experiment_files.FIT_KEYS,
-    "search": experiment_files.SEARCH_KEYS,
-    "sample": experiment_files.SAMPLE_KEYS,
-    "noise": experiment_files.NOISE_KEYS,
-    "free": systems.FREE_KEYS,
-    "prior": file_tables.PRIOR_KEYS,
-    "hierarchy": file_tables.HIERARCHY_KEYS,
-    "without": file_tables.ABLATION_KEYS,
+KEYS: dict[str, Mapping[str, Key]] = {
+    "top": keys(Experiment),
+    "clips": keys(ClipEntry),
+    "sigmas": ALL_SIGMA_KEYS,
+    "fit": FIT_KEYS,
+    "search": SEARCH_KEYS,
+    "sample": keys(SamplerSettings),
+    "noise": keys(NoiseOptions),
+    "free": keys(Override),
+    "prior": keys(ParameterPrior),
+    "hierarchy": keys(Hierarchy),
+    "without": keys(Ablation),
 }
 NUMBERS = [-1, -0.1, 0, 1e-12, 1e-9, 1e-3, 0.01, 0.5, 0.999, 1, 1.5, 2, 3, 1000, 1000.5, 1e6, 1e12]
 NUMBERS += [2**32 - 1, 2**32, 1e39, -1e39, math.inf, -math.inf]
@@ -77,8 +86,8 @@ MISTAKES = {
         ("", "there is no ..clips.."),
         ("clips = 3\n", r"clips is 3; wanted \[\[clips\]\]"),
         ("clips = [1]\n", r"\[\[clips\]\] is 1; wanted a table"),
-        ("[[clips]]\nterrain = 'x'\n", "there is no reference"),
-        (f"{CLIP}[[clips]]\nreference = 'a'\n", "there is no terrain; it needs reference and"),
+        ("[[clips]]\nterrain = 'x'\n", "reference is missing"),
+        (f"{CLIP}[[clips]]\nreference = 'a'\n", "terrain is missing; it needs reference and"),
         (f"{CLIP}bse = 'x'", r"\[\[clips\]\]: unknown key 'bse'; nearest is 'base' of"),
         (f"{CLIP}file_up = 'x'", "file_up is 'x'; wanted one of .'y', 'z'."),
         (f"{CLIP}start = 'x'", "start is 'x'; wanted a number of seconds"),
@@ -121,7 +130,8 @@ MISTAKES = {
         ("[fit]\nmaxsteps = 1", "unknown key 'maxsteps'; nearest is 'max_steps'"),
         ("[fit.search]\nelit = 3", r"\[fit.search\]: unknown key 'elit'; nearest is 'elite'"),
         ("[fit.search]\nmax_steps = 3", r"\[fit.search\]: unknown key 'max_steps'"),
-        ("[[without]]\nparameters = { lock.enabled = false }", "a variant without a name; wanted"),
+        ("[[without]]\nparameters = { lock.enabled = false }", "name is missing; it needs name"),
+        ("[[without]]\nname = 3", "name is 3; wanted a text"),
         ("[[without]]\nname = 'a'\nfixed = {}", "unknown key 'fixed'; nearest is 'free' of"),
     ],
 }
@@ -244,14 +254,13 @@ def test_it_is_a_schema_that_json_can_hold_and_what_is_shipped_or_written_is_val
 def test_the_schema_of_a_key_accepts_what_the_reader_accepts():
     offenders = []
     for table, key in ((table, key) for table, known in KEYS.items() for key in known):
-        constraint = KEYS[table][key]
-        (schema,) = named({key: constraint})["properties"].values()
-        validator = jsonschema.Draft202012Validator(schema)
+        constraint = KEYS[table][key].constraint
+        validator = jsonschema.Draft202012Validator(constraint.schema)
         for value in NUMBERS + OTHERS:
             if isinstance(value, float) and value.is_integer():
                 continue  # JSON Schema counts 2.0 as a whole number
-            if isinstance(value, list) and constraint.schema.get("items") is None:
-                continue  # elements of which the reader makes sure elsewhere
+            if isinstance(value, list | dict) and KEYS[table][key].inner is not None:
+                continue  # whose keys the reader checks one by one
             if validator.is_valid(value) != constraint.accepts(value):
                 offenders.append((table, key, value))
     assert offenders == []
@@ -270,7 +279,7 @@ def test_every_key_has_a_meaning_a_parameter_its_range_and_the_defaults_are_thos
     assert declared.doc in limit["description"] and "Unit: m." in limit["description"]
     assert f"Range: {declared.low:g} to {declared.high:g}." in limit["description"]
     assert "inf m in ozz" in limit["description"]
-    search = named(experiment_files.SEARCH_KEYS)["properties"]
+    search = table_schema(SEARCH_KEYS)["properties"]
     assert search["agreement"]["description"].endswith(" Unit: cost.")
     assert "Unit" not in search["min_step_gain"]["description"]
     tables = schema()["properties"]
@@ -295,8 +304,8 @@ def test_the_page_on_experiment_files_names_every_key():
 
 INF = math.inf
 TOP = {"fps": (1, 1000), "independent_every": (0, 1e6), "seed": (0, 2**32 - 1), "holdout": (0, 0.9)}
-SIGMAS = {kind: (LEAST_SIGMAS.get(kind, 1e-9), 1e9) for kind in experiment_files.KINDS}
-CORRELATIONS = dict.fromkeys(("correlation", *experiment_files.CORRELATIONS), (0, 0.999))
+SIGMAS = {kind: (LEAST_SIGMAS.get(kind, 1e-9), 1e9) for kind in experiment.SIGMAS}
+CORRELATIONS = dict.fromkeys(ALL_SIGMA_KEYS.keys() - SIGMAS.keys(), (0, 0.999))
 SEARCH = {
     "draws": (2, 100_000), "descents": (1, 1000), "agreement": (0, 1e6),
     "agreeing_starts": (1, 1000), "descent_steps": (1, 1000), "min_step_gain": (0, 1),
@@ -365,15 +374,15 @@ def test_a_number_of_a_clip_is_accepted_up_to_the_ends_of_its_range(tmp_path):
 
 
 def test_every_number_of_the_format_has_a_range_here():
-    assert SEARCH.keys() | {"max_steps"} == describe(SearchSettings).keys()
-    assert SAMPLE.keys() == describe(SamplerSettings).keys()
-    assert {**SIGMAS, **CORRELATIONS}.keys() == experiment_files.SIGMA_KEYS.keys()
+    assert SEARCH.keys() | {"max_steps"} == keys(SearchSettings).keys()
+    assert SAMPLE.keys() == keys(SamplerSettings).keys()
     of_clips = {*OF_CLIPS, "scale"}  # which no .npz has
-    for numbers, table in ((TOP, experiment_files.TOP_KEYS), (of_clips, schema_module.CLIP_KEYS)):
-        types = {key: constraint.schema.get("type") for key, constraint in table.items()}
+    for numbers, table in ((TOP, keys(Experiment)), (of_clips, keys(ClipEntry))):
+        types = {key: declared.schema.get("type") for key, declared in table.items()}
         assert {*numbers} == {key for key in types if types[key] in ("number", "integer")}
     for settings in (SearchSettings, SamplerSettings):
-        assert all(math.isfinite(declared.high) for declared in describe(settings).values())
+        highest = [declared.schema["maximum"] for declared in keys(settings).values()]
+        assert all(map(math.isfinite, highest))
 
 
 def test_a_range_may_be_a_millionth_or_million_times_the_declared_one_and_steps_fit_into_memory(

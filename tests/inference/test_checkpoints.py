@@ -228,7 +228,7 @@ NOT_FINITE = {"cost": [float("nan")], "u": [[0.0] * 3], "values": [[0.0] * 3]}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda stored: stored.update(stages=-1), "wanted a number from 0"),
+        (lambda stored: stored.update(stages=-1), "wanted a whole number from 0 to 100"),
         (lambda stored: stored["curves"].pop(), "there are 2 profiles of 3 parameters"),
         (lambda stored: stored["curves"][0]["cost"].pop(), "cannot reshape"),
         (lambda stored: stored["curves"][1]["u"][0].pop(), "damaged"),

@@ -16,7 +16,8 @@ import pytest
 
 from fitting.runtime import claimed_folder, files
 from fitting.runtime.claimed_folder import LOCK, claimed
-from fitting.runtime.json_files import Finite, JsonFile, between, checked, length
+from fitting.runtime.declarations import number
+from fitting.runtime.json_files import Finite, JsonFile, checked, length
 
 
 def names(folder):
@@ -251,7 +252,7 @@ class Size:
 
 class Row(TypedDict):
     name: str
-    u: Annotated[float, between(-40.0, 40.0)]
+    u: Annotated[float, number(-40.0, 40.0)]
     interval: Annotated[list[Finite], length(2)]
     kind: Literal["smooth", "threshold"]
     steps: int

@@ -22,7 +22,8 @@ from jaxtyping import Float
 
 from fitting.problem.problem import Problem, digest_with
 from fitting.runtime import activity, program_cache
-from fitting.runtime.json_files import Finite, JsonFile, between, length
+from fitting.runtime.declarations import count
+from fitting.runtime.json_files import Finite, JsonFile, length
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, in_one_line
 
@@ -77,7 +78,7 @@ class StoredPoints(TypedDict):
 class StoredProfiles(TypedDict):
     """The profiles of a solution as they were after some stages."""
 
-    stages: Annotated[int, between(0, 100)]
+    stages: Annotated[int, count(0, 100)]
     """Finished ones."""
     curves: list[StoredPoints]
     """Of each parameter."""

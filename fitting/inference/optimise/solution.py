@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.inference.settings import Settings, setting
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
+from fitting.runtime.declarations import Table, key
 
 from .levenberg_marquardt import LMState
 
@@ -112,7 +112,7 @@ class Solution:
 
 
 @dataclasses.dataclass(frozen=True)
-class SearchSettings(Settings):
+class SearchSettings(Table):
     """Settings of `search.find_best_fit`.
 
     Spreads are standard deviations of `u`, gains are relative falls of the cost.
@@ -121,100 +121,64 @@ class SearchSettings(Settings):
         ValueError: for a setting out of its range.
     """
 
-    max_steps: int = setting(
-        1000, "Levenberg–Marquardt steps allowed for each start.", unit="steps", low=1, high=100_000
+    max_steps: int = key(
+        1000, "Levenberg–Marquardt steps allowed for each start.", "steps", 1, 100_000
     )
     # Starts
-    draws: int = setting(
-        126,
-        "Draws from the prior of which the best descend.",
-        unit="candidates",
-        low=2,
-        high=100_000,
+    draws: int = key(
+        126, "Draws from the prior of which the best descend.", "candidates", 2, 100_000
     )
-    descents: int = setting(
+    descents: int = key(
         6,
         "Descents of a start, at most; half the number of parameters if that is less.",
-        low=1,
-        high=1000,
+        "",
+        1,
+        1000,
     )
-    agreement: float = setting(
-        3.0, "Two ends whose costs differ by no more than this agree.", unit="cost", high=1e6
+    agreement: float = key(
+        3.0, "Two ends whose costs differ by no more than this agree.", "cost", 0, 1e6
     )
-    agreeing_starts: int = setting(
-        2,
-        "Starts that must agree; they must also be half of those made.",
-        unit="starts",
-        low=1,
-        high=1000,
+    agreeing_starts: int = key(
+        2, "Starts that must agree; they must also be half of those made.", "starts", 1, 1000
     )
     # Levenberg–Marquardt
-    descent_steps: int = setting(
-        8,
-        "Steps of a descent, between two changes of the decisions.",
-        unit="steps",
-        low=1,
-        high=1000,
+    descent_steps: int = key(
+        8, "Steps of a descent, between two changes of the decisions.", "steps", 1, 1000
     )
-    min_step_gain: float = setting(
-        1e-6, "A step that lowers the cost by less than this is a small one.", high=1.0
+    min_step_gain: float = key(
+        1e-6, "A step that lowers the cost by less than this is a small one.", "", 0, 1.0
     )
-    max_small_steps: int = setting(
-        2, "Small steps in a row that end a descent.", unit="steps", low=1, high=1000
-    )
-    max_rejected_steps: int = setting(
+    max_small_steps: int = key(2, "Small steps in a row that end a descent.", "steps", 1, 1000)
+    max_rejected_steps: int = key(
         5,
         "Rejected steps in a row that end a descent; each shrinks the step to a quarter.",
-        unit="steps",
-        low=1,
-        high=1000,
+        "steps",
+        1,
+        1000,
     )
-    polish_max_rejected_steps: int = setting(
-        12,
-        "Rejected steps in a row that end the last descent of a start.",
-        unit="steps",
-        low=1,
-        high=1000,
+    polish_max_rejected_steps: int = key(
+        12, "Rejected steps in a row that end the last descent of a start.", "steps", 1, 1000
     )
     # Evolution
-    population: int = setting(
-        64, "Candidates in a generation.", unit="candidates", low=4, high=100_000
+    population: int = key(64, "Candidates in a generation.", "candidates", 4, 100_000)
+    generations: int = key(10, "Generations between two descents.", "generations", 1, 1000)
+    elite: int = key(24, "Candidates that parent the next generation.", "", 1, 100_000)
+    gauss_newton_children: int = key(
+        16, "Candidates of a generation that come again after a Gauss-Newton step.", "", 0, 100_000
     )
-    generations: int = setting(
-        10, "Generations between two descents.", unit="generations", low=1, high=1000
+    max_rounds: int = key(40, "Rounds of an evolution, at most.", "rounds", 1, 1000)
+    min_round_gain: float = key(
+        0.5, "A round that lowers the cost by less than this is an idle one.", "cost", 0, 1e6
     )
-    elite: int = setting(24, "Candidates that parent the next generation.", low=1, high=100_000)
-    gauss_newton_children: int = setting(
-        16, "Candidates of a generation that come again after a Gauss-Newton step.", high=100_000
-    )
-    max_rounds: int = setting(
-        40, "Rounds of an evolution, at most.", unit="rounds", low=1, high=1000
-    )
-    min_round_gain: float = setting(
-        0.5, "A round that lowers the cost by less than this is an idle one.", unit="cost", high=1e6
-    )
-    patience: int = setting(
-        4, "Idle rounds in a row that end an evolution.", unit="rounds", low=1, high=1000
-    )
+    patience: int = key(4, "Idle rounds in a row that end an evolution.", "rounds", 1, 1000)
     # Sweeps
-    sweep_values: int = setting(
-        6, "Values that a sweep tries for each parameter.", unit="values", low=1, high=1000
+    sweep_values: int = key(6, "Values that a sweep tries for each parameter.", "values", 1, 1000)
+    sweep_tries: int = key(
+        2, "Sweeps without a sufficient gain that end the sweeping.", "sweeps", 1, 1000
     )
-    sweep_tries: int = setting(
-        2,
-        "Sweeps without a sufficient gain that end the sweeping.",
-        unit="sweeps",
-        low=1,
-        high=1000,
-    )
-    min_sweep_gain: float = setting(
-        1e-5, "Gain that makes a sweep's result worth taking.", high=1.0
-    )
-    sweeps: int = setting(
-        1,
-        "Sweeps of a descent, at most, each with another descent after it.",
-        unit="sweeps",
-        high=1000,
+    min_sweep_gain: float = key(1e-5, "Gain that makes a sweep's result worth taking.", "", 0, 1.0)
+    sweeps: int = key(
+        1, "Sweeps of a descent, at most, each with another descent after it.", "sweeps", 0, 1000
     )
 
     def __post_init__(self) -> None:

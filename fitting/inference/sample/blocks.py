@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from fitting.inference.settings import Settings, setting
+from fitting.runtime.declarations import Table, key
 
 # s, of a block. A step of a walk takes about half of it, and errors that come with a step hardly
 # last beyond the next one. The same for every fit, so that fits can be compared.
@@ -143,35 +143,30 @@ def _neighbours(values: np.ndarray, clip: np.ndarray) -> float:
 
 
 @dataclasses.dataclass(frozen=True)
-class SamplerSettings(Settings):
+class SamplerSettings(Table):
     """Settings of `posterior.sample_posterior`.
 
     Raises:
         ValueError: for a setting out of its range.
     """
 
-    walkers: int | None = setting(
-        None, "Walkers: an even number, by default four per free parameter.", low=1, high=10_000
+    walkers: int | None = key(
+        None, "Walkers: an even number, by default four per free parameter.", "", 1, 10_000
     )
-    max_steps: int = setting(
-        20_000,
-        "Steps of the sampler at most, over all runs of a chain.",
-        unit="steps",
-        low=1,
-        high=10**9,
+    max_steps: int = key(
+        20_000, "Steps of the sampler at most, over all runs of a chain.", "steps", 1, 10**9
     )
-    min_steps: int = setting(
-        0, "Steps before which sampling does not stop.", unit="steps", high=10**9
+    min_steps: int = key(0, "Steps before which sampling does not stop.", "steps", 0, 10**9)
+    thin_by: int = key(1, "One step in so many is stored.", "steps", 1, 10**6)
+    check_every: int = key(
+        100, "Steps between reports, and at least between checks of convergence.", "", 1, 10**6
     )
-    thin_by: int = setting(1, "One step in so many is stored.", unit="steps", low=1, high=10**6)
-    check_every: int = setting(
-        100, "Steps between reports, and at least between checks of convergence.", low=1, high=10**6
-    )
-    stop_at: float = setting(
+    stop_at: float = key(
         50.0,
         "Length that ends the sampling, if the time is steady.",
-        unit="autocorrelation times",
-        high=1e12,
+        "autocorrelation times",
+        0,
+        1e12,
     )
 
     def __post_init__(self) -> None:

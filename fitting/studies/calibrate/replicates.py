@@ -38,7 +38,8 @@ from fitting.inference.sample.posterior import Posterior
 from fitting.problem.problem import Problem, digest
 from fitting.problem.simulation import simulate
 from fitting.problem.space import FreeParameter, to_fractions
-from fitting.runtime.json_files import Finite, JsonFile, between, length
+from fitting.runtime.declarations import count
+from fitting.runtime.json_files import Finite, JsonFile, length
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
 from fitting.studies.campaign import Campaign
@@ -268,7 +269,7 @@ class ReplicateChain(TypedDict):
     """The posterior of a replicate, as its file holds it."""
 
     number: int
-    ranks: dict[str, Annotated[int, between(0.0, float(DRAWS))]]
+    ranks: dict[str, Annotated[int, count(0, DRAWS)]]
     """Number of independent draws, of `DRAWS`, below the truth: of each parameter, and of the
     log-probability."""
     intervals: dict[str, Annotated[list[Interval], length(len(LEVELS))]]

@@ -24,8 +24,9 @@ from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED, Scene
 from fitting.problem.space import Space, gain_readings
 from fitting.runtime import activity
+from fitting.runtime.declarations import number
 from fitting.runtime.display import Shown, data_frame
-from fitting.runtime.json_files import Finite, between, length
+from fitting.runtime.json_files import Finite, length
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
@@ -43,8 +44,8 @@ THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
 
 # Beyond these, a parameter is at the end of its range to the last digit, where no fit ends.
-U: TypeAlias = Annotated[float, between(-40.0, 40.0)]
-StartSd: TypeAlias = Annotated[float, between(1e-6, 40.0)]
+U: TypeAlias = Annotated[float, number(-40.0, 40.0)]
+StartSd: TypeAlias = Annotated[float, number(1e-6, 40.0)]
 Interval: TypeAlias = Annotated[list[Finite], length(2)]
 
 

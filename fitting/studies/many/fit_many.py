@@ -31,7 +31,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodF
 
 from fitting.experiment import file_tables
 from fitting.experiment.experiment import ClipEntry, Experiment
-from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiment.experiment_files import clip_to_table, experiment_to_toml, load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import LoadedExperiment
 from fitting.report import pages
@@ -117,7 +117,7 @@ class FitTask:
         contents = [
             _digest(value)
             for entry in self.experiment.clips
-            for value in vars(entry).values()
+            for value in clip_to_table(entry).values()
             if isinstance(value, Path)
         ]
         return hashlib.sha256(repr((text, contents)).encode()).hexdigest()
