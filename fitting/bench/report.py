@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import PyTree
 from matplotlib.figure import Figure as PlotFigure
@@ -45,7 +46,7 @@ def _loads(report: Report) -> list[float]:
     return [measurement.load for measurement in report.measurements] + [load_average()]
 
 
-def _numbers(measurement: Measurement) -> dict[str, object]:
+def _numbers(measurement: Measurement) -> dict[str, Any]:
     numbers = dataclasses.asdict(measurement)
     for figure, entry in zip(measurement.figures, numbers["figures"], strict=True):
         entry |= {"met": figure.met, "closeness": figure.closeness}
