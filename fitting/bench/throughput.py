@@ -31,6 +31,7 @@ from fitting.experiment.systems import Preset
 from fitting.runtime import cache_folder, xla
 from fitting.runtime.cluster import Stopwatch, peak_mb
 from fitting.runtime.threads import cpu_block, usable_cores
+from fitting.studies.animations import Animation
 from fitting.viewer import Solver, Subject, Take, knobs
 from fitting.viewer.subject import DEFAULT, cost_of_problem
 from jaxik.world import terrain
@@ -404,7 +405,8 @@ def subject(frame_count: int) -> Subject:
     reference, base = (edit.resample(clip, RATE) for clip in (reference, base))
     data = ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces))
     problem = workloads.problem_from_clips([data])
-    take = Take("walk", base, data.terrain, problem.data[0].frames, captured=reference)
+    frames = problem.data[0].frames
+    take = Take("walk", Animation(base, data.terrain, given_frames=frames, captured=reference))
     cost = functools.partial(cost_of_problem, problem)
     starts = {DEFAULT: problem.space.system}
     return Subject("walk", (take,), starts, Preset("record", faithful=True), cost=cost)
@@ -428,6 +430,6 @@ def drag(measurement: Measurement, sizes: Sizes) -> None:
         solver.solve(knob.write(ik, value))
 
     measurement.time_in_turns({"drag": solve})
-    seconds = solver.take.base.seconds
+    seconds = solver.animation.clip.seconds
     what = f"a drag, {seconds:.0f} s at {RATE:g} Hz"
     measurement.add_timing("drag", what, "ms", at_most=TARGET)

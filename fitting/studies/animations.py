@@ -165,12 +165,17 @@ class Animation:
             ik = systems.without_own_root(ik)
         terrain = ik.probe.prepare(self.terrain)
         terrain = terrain if self.carried is None else moving(terrain, 0)
-        tracks = {name: jnp.asarray(values) for name, values in self.tracks.items()}
-        result = program_cache.run(ik, self.clip.rig, terrain, self.frames, tracks=tracks or None)
+        result = replace(self, terrain=terrain, given_frames=self.frames).run(ik)
         solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite; nothing was written")
         return result, solved
+
+    def run(self, ik: jaxik.FootIK) -> jaxik.Result:
+        """The result of a system on the terrain, which its probe has prepared."""
+        tracks = {name: jnp.asarray(values) for name, values in self.tracks.items()}
+        rig, frames = self.clip.rig, self.frames
+        return program_cache.run(ik, rig, self.terrain, frames, tracks=tracks or None)
 
     def reached(self, result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
         """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.
@@ -200,7 +205,7 @@ class Animation:
             result: of the system that made it; None leaves unknown which targets are reached.
         """
         reached = None if result is None else self.reached(result)
-        own = self._own_speed
+        own = self.own_speed
         return place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
 
     def cause(self, motion: PlacedMotion) -> Cause | None:
@@ -220,13 +225,13 @@ class Animation:
                 return self._soles(raised(self.clip, choice.rise))
             if cause.kind == "units" and self.files is not None:
                 terrain = self.files.load_terrain_in(cause.amount)
-                return measures.soles(self.placed_clip, self._own_speed, terrain, self.floor)
+                return measures.soles(self.placed_clip, self.own_speed, terrain, self.floor)
         except ValueError:  # no ground below the path, or a terrain beyond all bounds
             pass
         return None
 
-    @property
-    def _own_speed(self) -> Clip:
+    @cached_property
+    def own_speed(self) -> Clip:
         """The animation at its own speed, by which soles and slides are judged.
 
         With a faster root its standing feet skate, which is to be measured and not to be excused.
@@ -234,7 +239,7 @@ class Animation:
         return at_speed(self.clip, 1.0 / self.speed)
 
     def _soles(self, solved: Clip) -> Soles:
-        return measures.soles(solved, self._own_speed, self.terrain, self.floor)
+        return measures.soles(solved, self.own_speed, self.terrain, self.floor)
 
 
 def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:

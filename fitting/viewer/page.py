@@ -77,14 +77,14 @@ class Viewer:
         self._lock = threading.RLock()
         self._figure = Figure(server, self.solver)
         self._build_panel()
-        clip = self.solver.take.animated
+        clip = self.solver.animation.placed_clip
         self._player = Player(clip.seconds, self._draw_time)
         self._latest = Latest(self._solve)
         self._connect()
         self._latest.ask()
 
     def _build_panel(self) -> None:
-        gui, clip = self.server.gui, self.solver.take.animated
+        gui, clip = self.server.gui, self.solver.animation.placed_clip
         gui.add_markdown(f"**{literal(self.subject.title)}**")
         if len(self.subject.takes) > 1:
             names = tuple(take.name for take in self.subject.takes)
@@ -92,7 +92,7 @@ class Viewer:
             choice.on_update(lambda _: self._choose(names.index(choice.value)))
         self._way_back = WayBackPanel(gui, self.tuning.starts)
         self._time = TimePanel(gui, clip.frame_count)
-        self._shown = ShownPanel(gui, any(take.captured for take in self.subject.takes))
+        self._shown = ShownPanel(gui, any(take.animation.captured for take in self.subject.takes))
         every = knobs(self.tuning.ik, self.subject.rig, self.subject.free)
         self._knobs = KnobPanel(gui, every, self.tuning.ik, self._move)
 
@@ -204,7 +204,7 @@ class Viewer:
             self.solver, self._figure = solver, Figure(self.server, solver)
             self._figure.follows = self._time.follow.value
             self._show_chosen()
-            clip = solver.take.animated
+            clip = solver.animation.placed_clip
             self._player.seconds = clip.seconds
             self._time.frame.max = max(clip.frame_count - 1, 1)
             self._seek(0)
@@ -224,7 +224,7 @@ class Figure:
     @in_float64
     def __init__(self, server: viser.ViserServer, solver: Solver):
         self.server, self.solver = server, solver
-        clip = solver.take.animated
+        clip = solver.animation.placed_clip
         self.frame_count, self.fps = clip.frame_count, clip.fps
         self.origin = solver.path_ws[0].copy()  # what is drawn has 32 bits
         frames = max(1, round(STEADY * clip.fps))
@@ -237,7 +237,7 @@ class Figure:
         server.initial_camera.look_at = np.zeros(3)
         server.initial_camera.position = VIEW_FROM * body.ratio(clip.rig)
         server.initial_camera.up = (0.0, 1.0, 0.0)
-        self._add_ground(ground_patch.around_path(clip, solver.take.terrain))
+        self._add_ground(ground_patch.around_path(clip, solver.animation.terrain))
         self._put_motion("before", solver.before)
         if solver.captured is not None:
             self._put_motion("captured", solver.captured)

@@ -13,7 +13,6 @@ from fitting.clips.clip_frames import clip_from_result
 from fitting.motion import measures
 from fitting.motion.measures import VISIBLE, Measures, PlacedMotion, Soles
 from fitting.motion.playback import stage_outputs
-from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64
 from jaxik.world import body
 from jaxik.world.similarity import similar
@@ -124,15 +123,17 @@ class Solver:
 
     def __init__(self, subject: Subject, number: int = 0):
         self.subject = subject
-        self.take: Take = subject.takes[number]
-        self.before = self._drawn(self.take.animated, "before")
-        captured = self.take.captured
+        self.take = subject.takes[number]
+        self.animation = self.take.animation
+        self.before = self._drawn(self.animation.placed_clip, "before")
+        captured = self.animation.captured
         self.captured = None if captured is None else self._drawn(captured, "captured")
 
     @property
     def path_ws(self) -> Float[np.ndarray, "frames 3"]:
         """Where the animated pelvis is, m."""
-        return self.take.animated.positions_ws[:, self.take.base.rig.pelvis]
+        clip = self.animation.placed_clip
+        return clip.positions_ws[:, clip.rig.pelvis]
 
     @in_float64
     def solve(self, ik: jaxik.FootIK) -> Solved:
@@ -141,10 +142,10 @@ class Solver:
         Raises:
             ValueError: the poses are not finite.
         """
-        began, take = time.perf_counter(), self.take
+        began, own = time.perf_counter(), self.animation
         cost = None if self.subject.cost is None else self.subject.cost(ik)  # runs meanwhile
-        result = jax.tree.map(np.asarray, result_of(ik, take))
-        solved = clip_from_result(take.base, result, floor=take.floor, rise=take.root.rise)
+        result = jax.tree.map(np.asarray, result_of(ik, self.take))
+        solved = clip_from_result(own.clip, result, floor=own.floor, rise=own.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite")
         motion = self._drawn(solved, "after")
@@ -154,9 +155,8 @@ class Solver:
 
     @in_float64
     def _drawn(self, clip: Clip, name: str) -> Drawn:
-        take = self.take
-        placed = measures.place(clip, take.animated, take.own_speed, take.terrain, take.floor)
-        sight = seen(placed.soles, clip, take.own_speed)
+        placed = self.animation.place(clip)
+        sight = seen(placed.soles, clip, self.animation.own_speed)
         bones = np.array([[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0])
         starts, ends = np.moveaxis(clip.positions_ws[:, bones], 2, 0)
         feet = _feet(placed, sight.colours(SKELETONS[name]))
@@ -167,8 +167,7 @@ class Solver:
 def result_of(ik: jaxik.FootIK, take: Take) -> jaxik.Result:
     """The result of a system on a clip, by the program that fits and commands use, too."""
     own = ik if take.size is None else similar(ik, take.size)
-    rig, tracks = take.base.rig, dict(take.tracks) or None
-    return program_cache.run(own, rig, take.terrain, take.frames, tracks=tracks)
+    return take.animation.run(own)
 
 
 def _feet(motion: PlacedMotion, colours: np.ndarray) -> Lines:

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -13,14 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 import jaxik
-from fitting.clips import Clip
-from fitting.clips.clip_frames import raised
-from fitting.clips.edit import at_speed
 from fitting.experiment import problems, systems
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.problems import ClipData
 from fitting.experiment.systems import Preset
-from fitting.ground.ground_path import AS_ANIMATED, RootChoice
 from fitting.inference.noise import NoiseModel, with_noise
 from fitting.motion.measures import with_soles_of
 from fitting.problem.capture_system import alone, is_of_capture, system_and_scenes
@@ -30,11 +26,10 @@ from fitting.problem.scene import Scene
 from fitting.problem.space import FreeParameter, Vector
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.program_cache import cached
-from fitting.studies.animations import AnimationFiles, load_animation
+from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
-from jaxik.world.terrain import Terrain
 
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to
 Cost = Callable[[jaxik.FootIK], Float[Array, ""]]
@@ -50,31 +45,10 @@ class Take:
     """One clip on its ground."""
 
     name: str
-    base: Clip
-    """The flat animation, on its floor."""
-    terrain: Terrain
-    """As the rays of the system need it."""
-    frames: jaxik.Frame
-    root: RootChoice = AS_ANIMATED
-    floor: float = 0.0
-    """m, height of the floor on which the clip was animated."""
-    speed: float = 1.0
-    """Of the clip's root over that with which its feet step."""
-    tracks: Mapping[str, Array] = field(default_factory=dict)
-    """Parameters that change along the clip."""
+    animation: Animation
+    """On a terrain as the rays of the system need it."""
     size: Float[Array, ""] | None = None
     """Of the body over the one that the numbers are for; see `Scene`."""
-    captured: Clip | None = None
-
-    @cached_property
-    def animated(self) -> Clip:
-        """The flat animation with its root where foot IK gets it."""
-        return raised(self.base, self.root.rise)
-
-    @cached_property
-    def own_speed(self) -> Clip:
-        """The flat animation at the speed at which its feet step, whose slides do not count."""
-        return self.base if self.speed == 1.0 else at_speed(self.base, 1.0 / self.speed)
 
 
 @dataclass(frozen=True)
@@ -97,7 +71,7 @@ class Subject:
     @property
     def rig(self) -> jaxik.Rig:
         """The body on which the ranges of parameters depend."""
-        return self.takes[0].base.rig
+        return self.takes[0].animation.clip.rig
 
 
 @cached
@@ -154,13 +128,15 @@ def subject_of_fit(
     takes = tuple(
         Take(
             name=scene.reference.label if len(clips) == 1 else f"{number}: {clip.base.source}",
-            base=clip.base,
-            terrain=scene.terrain,
-            frames=scene.frames,
-            root=clip.root,
-            tracks=scene.tracks,
+            animation=Animation(
+                clip.base,
+                scene.terrain,
+                root=clip.root,
+                tracks=scene.tracks,
+                given_frames=scene.frames,
+                captured=with_soles_of(clip.reference, clip.base),
+            ),
             size=scene.size,
-            captured=with_soles_of(clip.reference, clip.base),
         )
         for number, (clip, scene) in enumerate(zip(clips, scenes, strict=True), 1)
     )
@@ -199,26 +175,15 @@ def subject_of_animation(
         starts = {name: systems.without_own_root(ik) for name, ik in starts.items()}
     first = next(iter(starts.values()))
     loaded.check_shapes(first)
-    terrain = first.probe.prepare(loaded.terrain)
-    tracks = {name: jnp.asarray(values) for name, values in loaded.tracks.items()}
-    captured = cost = None
-    if loaded.captured is not None:
-        captured = with_soles_of(loaded.captured, loaded.clip)
+    terrain, captured, cost = first.probe.prepare(loaded.terrain), loaded.captured, None
+    if captured is not None:
+        captured = with_soles_of(captured, loaded.clip)
         if files.floor == 0.0:  # a scene knows no other
             data = ClipData(captured, loaded.clip, terrain, loaded.root, loaded.tracks)
             cost = partial(cost_of_scenes, (problems.make_scene(data, {}),))
-    take = Take(
-        name=Path(files.clip).name,
-        base=loaded.clip,
-        terrain=terrain,
-        frames=loaded.frames,
-        root=loaded.root,
-        floor=loaded.floor,
-        speed=loaded.speed,
-        tracks=tracks,
-        captured=captured,
-    )
-    title = f"{Path(files.clip).name} on {Path(files.terrain).name}"
+    prepared = replace(loaded, terrain=terrain, given_frames=loaded.frames, captured=captured)
+    take = Take(files.clip.name, prepared)
+    title = f"{files.clip.name} on {files.terrain.name}"
     return Subject(title, (take,), starts, preset, cost=cost)
 
 

@@ -396,7 +396,7 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
     subject = throughput.subject(12)
     (take,), (system,) = subject.takes, subject.starts.values()
-    assert take.base.fps == throughput.RATE and take.base.frame_count == 6
+    assert take.animation.clip.fps == throughput.RATE and take.animation.clip.frame_count == 6
     assert system.leg is not None and subject.cost is not None
     problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
@@ -465,7 +465,7 @@ def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     systems = []
     ik, clip = presets.record(), workloads.walk(12)
     subject = SimpleNamespace(starts={throughput.DEFAULT: ik}, rig=clip.rig)
-    solver = SimpleNamespace(solve=systems.append, take=SimpleNamespace(base=clip))
+    solver = SimpleNamespace(solve=systems.append, animation=SimpleNamespace(clip=clip))
     monkeypatch.setattr(throughput, "subject", lambda frame_count: subject)
     monkeypatch.setattr(throughput, "Solver", lambda subject: solver)
     timings = measure("view")

@@ -121,7 +121,7 @@ def test_a_dragged_slider_moves_the_feet_and_undo_brings_them_back(viewer, page)
 
 def test_time_is_scrubbed_and_plays(viewer, page):
     drag(page, "Frame", 400)
-    last = str(viewer.solver.take.frames.dt.size - 1)
+    last = str(viewer.solver.animation.frames.dt.size - 1)
     until(page, lambda: slider(page, "Frame").get_attribute("aria-valuenow") == last)
     page.get_by_label("Play").click()
     until(page, lambda: slider(page, "Frame").get_attribute("aria-valuenow") != last)

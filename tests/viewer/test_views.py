@@ -222,7 +222,7 @@ def test_deep_feet_are_red_and_sliding_ones_purple_counted_from_the_beginning_of
     sight = Sight(np.array([[0.0, VISIBLE, 0.0]]), np.array([[0.0, 0.0, VISIBLE]]))
     plain, deep, slid = sight.colours((10, 20, 30))[0].tolist()
     assert plain == [10, 20, 30] and deep == list(IN_GROUND) and slid[0] > 200 < slid[2]
-    clip = solver.take.animated
+    clip = solver.animation.placed_clip
     stance = np.zeros((clip.frame_count, 2), bool)
     stance[1:4, 0] = True
     drift = np.arange(clip.frame_count)[:, None, None] * np.array([0.01, 0.0, 0.0])
