@@ -17,6 +17,7 @@ from fitting.inference.profiles import profiling
 from fitting.inference.profiles.profile import Curves
 from fitting.problem.problem import Problem
 from support.curves import curve_problem
+from support.watching import listening
 
 # Two ends are too few to agree, so that each start takes all stages.
 SETTINGS = SearchSettings(
@@ -157,7 +158,8 @@ def test_a_state_that_cannot_be_used_is_named_and_the_search_begins_anew(path, d
     lines = []
     solve(path, SHORT)
     change_file(path, damage)
-    assert_same(solve(path, SHORT, warn=lines.append), whole(SHORT))
+    with listening(lines.append):
+        assert_same(solve(path, SHORT), whole(SHORT))
     assert_warned(lines, message)
     assert len(names_in(path)) == 8
 
@@ -166,7 +168,8 @@ def test_a_file_that_is_no_state_is_named(path):
     for content in (b'{"format": 1, "ident', b"\xff\x00"):
         path.write_bytes(content)
         lines = []
-        checkpoints_in(path, warn=lines.append)
+        with listening(lines.append):
+            checkpoints_in(path)
         assert_warned(lines, "not the state of a search")
 
 
@@ -243,5 +246,6 @@ def test_profiles_that_cannot_be_used_are_named_and_begin_anew(path, monkeypatch
     kill_at(1, monkeypatch, path)
     change_file(path, lambda content: change(next(iter(content["profiles"].values()))))
     monkeypatch.setattr(profiling, "STAGES", [])
-    find_curves(path, warn=lines.append)
+    with listening(lines.append):
+        find_curves(path)
     assert_warned(lines, message)
