@@ -49,7 +49,7 @@ from fitting.report.document import (
     Text,
 )
 from fitting.report.formatting import Table, meanings, number, transposed
-from fitting.report.style import AFTER, CAPTURED, STAGES, legend, styled
+from fitting.report.style import AFTER, CAPTURED, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64

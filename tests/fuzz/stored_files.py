@@ -40,7 +40,8 @@ PARAMETER = {
     "valleys": [{"value": 0.2, "rise": 0.0, "interval": [0.1, 0.3], "values": [0.2]}],
 }
 ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
-OUTCOME = {"number": 0, "cost": 10.5, "starts": 2, "agreeing": 2, "parameters": [PARAMETER]}
+SEARCH = ENDING | {"cost_before": 99.5, "cost": 10.5, "steps": 8, "starts": 2, "agreeing": 2}
+REPLICATE = SEARCH | {"number": 0, "parameters": [PARAMETER]}
 FIT = {"truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "truth_valley_cost": 10.0}
 CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, LOG_PROBABILITY: 3}}
 CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
@@ -49,9 +50,9 @@ JUDGEMENT = {"fits": True, "sentence": "Fits.", "distances": dict.fromkeys(PARTS
 WRONG_MODEL = {"truth_values": {"lean.gain": 0.2}, "errors": {"drift": 0.01}}
 WRONG_MODEL |= dict.fromkeys(("captured", "lasting", "noise_free"), JUDGEMENT)
 REPLICATES = {
-    "fits": OUTCOME | FIT | ENDING,
+    "fits": REPLICATE | FIT,
     "chains": CHAIN | ENDING,
-    "wrong_model": OUTCOME | WRONG_MODEL | ENDING,
+    "wrong_model": REPLICATE | WRONG_MODEL,
 }
 KINDS = {
     kind.folder: kind for kind in (calibration.FITS, calibration.CHAINS, wrong_model.WRONG_MODEL)
@@ -102,7 +103,7 @@ def _go_on(problem: Problem, solution: Solution, path: Path) -> None:
 
 
 def found_text() -> bytes:
-    return text_of({"name": "all clips", "u": [0.5, -0.25], "cost": 10.5, **ENDING})
+    return text_of({"name": "all clips", "u": [0.5, -0.25], **SEARCH})
 
 
 def load_found(path: Path) -> None:

@@ -126,7 +126,7 @@ def test_each_fit_is_a_run_and_a_row(finished):
     for row in finished.rows:
         experiment, summary = run_folder.load_fit(finished.folder / row["run"])
         assert len(experiment.clips) == 1 and experiment.seed == row["seed"]
-        assert "outcome" in row and summary["cost"] == row["outcome"]["cost"]
+        assert "fit" in row and {**summary, "history": []} == row["fit"]
     present = read(finished.folder / many_fits.CSV)
     assert [row["run"] for row in present] == [row["run"] for row in finished.rows]
     assert float(present[0]["pelvis.on_gain"]) == pytest.approx(0.3, abs=0.02)

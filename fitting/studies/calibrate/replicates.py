@@ -44,7 +44,7 @@ from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
 from fitting.studies.campaign import Campaign
 from fitting.studies.fit.assess import assess_solution, search_with_noise
-from fitting.studies.fit.fit import Fit, FittedParameter, Interval
+from fitting.studies.fit.fit import Fit, FittedParameter, Interval, SearchRecord
 from fitting.studies.sample.sample import sample_around, with_open_noise
 
 if TYPE_CHECKING:
@@ -235,25 +235,15 @@ class Truth(NamedTuple):
     """Of the search and the sampler."""
 
 
-class Outcome(TypedDict):
+class Replicate(SearchRecord):
     """The fit of a replicate of any kind, as its file holds it."""
 
     number: int
     """From 0."""
-    cost: float
-    converged: bool
-    message: str
-    starts: int
-    agreeing: int
-    seconds: float
-    """For the search."""
     parameters: list[FittedParameter]
-    """As `fit.json` has them."""
-    noise: NotRequired[Annotated[Content, NoiseModel]]
-    """Where the experiment estimates it."""
 
 
-class ReplicateFit(Outcome):
+class ReplicateFit(Replicate):
     """The fit to motion that the experiment's own system makes."""
 
     truth_u: list[Finite]
@@ -311,7 +301,9 @@ def fit_replicate(
     ]
     settings = experiment.fit.search
     return {
-        **outcome(number, fitted),
+        "number": number,
+        **fitted.search,
+        "parameters": fitted.parameters,
         "truth_u": truth.u.tolist(),
         "truth": values.tolist(),
         "truth_levels": levels,
@@ -354,24 +346,6 @@ def chain_line(chain: ReplicateChain) -> str:
         f"replicate {chain['number'] + 1}: chain with {chain['draws']} independent draws"
         f"{'' if chain['converged'] else ', not converged'}; {chain['seconds']:.0f} s"
     )
-
-
-def outcome(number: int, fitted: Fit) -> Outcome:
-    """What the file of a replicate says of its fit; numbers count from 0."""
-    solution = fitted.solution
-    result: Outcome = {
-        "number": number,
-        "cost": solution.cost,
-        "converged": solution.converged,
-        "message": solution.message,
-        "starts": solution.starts,
-        "agreeing": solution.agreeing,
-        "seconds": solution.seconds,
-        "parameters": fitted.parameters,
-    }
-    if fitted.experiment.noise.estimates_any:
-        result["noise"] = dataclasses.asdict(fitted.noise)
-    return result
 
 
 def sample_replicate(

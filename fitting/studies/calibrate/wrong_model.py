@@ -69,12 +69,11 @@ from .replicates import (
     WRITER,
     Judgement,
     Kind,
-    Outcome,
+    Replicate,
     claim,
     fit_simulated,
     make_replicates,
     numbers,
-    outcome,
 )
 
 SPREAD = 0.3  # of u, in which the truth's parameters are drawn around the values of the system
@@ -144,7 +143,7 @@ class Verdict(TypedDict):
     distances: PartDistances
 
 
-class WrongModelFit(Outcome):
+class WrongModelFit(Replicate):
     """The fit to motion that another system has made."""
 
     truth_values: dict[str, Finite]
@@ -312,7 +311,9 @@ def fit_wrong_model(
     own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
     fitted = fit_simulated(captured, own)
     return {
-        **outcome(number, fitted),
+        "number": number,
+        **fitted.search,
+        "parameters": fitted.parameters,
         "truth_values": values,
         "errors": dataclasses.asdict(sizes),
         "captured": _judged(fitted),

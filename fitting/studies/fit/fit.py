@@ -219,15 +219,11 @@ class FittedParameter(TypedDict):
     gain_at_60_hz: NotRequired[float]
 
 
-class FitSummary(TypedDict):
-    """The content of `fit.json`."""
+class SearchRecord(TypedDict):
+    """What a search has found, as the files of all studies hold it."""
 
-    experiment: str
     converged: bool
     message: str
-    goodness: GoodnessSummary
-    distances: NotRequired[DistancesSummary]
-    """Fits by earlier versions lack them."""
     noise: NotRequired[Annotated[Content, NoiseModel]]
     """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
@@ -238,6 +234,34 @@ class FitSummary(TypedDict):
     agreeing: int
     """Starts that ended at this cost, or hardly above it."""
     seconds: float
+
+
+def record_search(
+    experiment: Experiment, problem: Problem[jaxik.FootIK], solution: Solution
+) -> SearchRecord:
+    """The record of a solution, and of the noise of its problem if the experiment estimates it."""
+    record: SearchRecord = {
+        "converged": solution.converged,
+        "message": solution.message,
+        "cost_before": solution.cost_before,
+        "cost": solution.cost,
+        "steps": solution.steps,
+        "starts": solution.starts,
+        "agreeing": solution.agreeing,
+        "seconds": solution.seconds,
+    }
+    if experiment.noise.estimates_any:
+        record["noise"] = dataclasses.asdict(noise_of(problem))
+    return record
+
+
+class FitRecord(SearchRecord):
+    """The content of `fit.json`."""
+
+    experiment: str
+    goodness: GoodnessSummary
+    distances: NotRequired[DistancesSummary]
+    """Fits by earlier versions lack them."""
     parameters: list[FittedParameter]
     correlated: list[list[str | float]]
     """Two names and their correlation."""
@@ -397,31 +421,25 @@ class Fit(Shown):
 
     @cached_property
     @in_float64
-    def summary(self) -> FitSummary:
+    def summary(self) -> FitRecord:
         """The numbers of the fit as JSON holds them."""
-        solution = self.solution
-        summary: FitSummary = {
+        return {
             "experiment": self.experiment.name,
-            "converged": solution.converged,
-            "message": solution.message,
+            **self.search,
             "goodness": summarise(self.verdict, self.groups),
             "distances": summarise_distances(self.distances),
-            "cost_before": solution.cost_before,
-            "cost": solution.cost,
-            "steps": solution.steps,
-            "starts": solution.starts,
-            "agreeing": solution.agreeing,
-            "seconds": solution.seconds,
             "parameters": self.parameters,
             "correlated": [list(pair) for pair in self.identifiability.correlated],
             "weakest": list(self.identifiability.weakest),
-            "history": [dataclasses.asdict(step) for step in solution.history],
+            "history": [dataclasses.asdict(step) for step in self.solution.history],
             "left": list(self.left),
             "improvement": self.identifiability.improvement,
         }
-        if self.experiment.noise.estimates_any:
-            summary["noise"] = dataclasses.asdict(self.noise)
-        return summary
+
+    @property
+    def search(self) -> SearchRecord:
+        """What its search has found."""
+        return record_search(self.experiment, self.problem, self.solution)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:

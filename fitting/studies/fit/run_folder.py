@@ -44,7 +44,7 @@ from fitting.studies.sample.predictive import Band, PredictiveCheck, Statistic
 from fitting.studies.sample.replay import Replay
 from fitting.studies.sample.sample import SampledFit
 
-from .fit import Fit, FitSummary
+from .fit import Fit, FitRecord
 from .fit_motions import saved_clips
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
@@ -56,7 +56,7 @@ SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that 
 HINT = "`jaxik fit` makes a run"
 UNFINISHED = "its fit is going on, or was stopped and goes on when its command is called again"
 FIT_FILE = JsonFile(
-    FitSummary, "the numbers of a fit", HINT, essential={"parameters", *SAMPLER_KEYS}
+    FitRecord, "the numbers of a fit", HINT, essential={"parameters", *SAMPLER_KEYS}
 )
 FORMAT = 1  # of the two TOML files, in their first line, which is a comment to other readers
 FORMAT_LINE = re.compile(r"# jaxik run, format (\w+)\n")
@@ -130,14 +130,24 @@ def save_fit(run: Path, fitted: Fit) -> None:
         FIT_FILE.write(run / FIT, fitted.summary)
 
 
-def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
+def load_record(run: Path) -> FitRecord:
+    """The numbers of a run.
+
+    Raises:
+        ValueError: the folder holds no finished fit.
+    """
+    _check_files(run, (FIT,))
+    return FIT_FILE.read(run / FIT, _check_numbers)
+
+
+def load_fit(run: Path) -> tuple[Experiment, FitRecord]:
     """The experiment and the numbers of a run.
 
     Raises:
         ValueError: the folder holds no finished fit, or a clip of its experiment is gone.
     """
     _check_files(run, (EXPERIMENT, FIT, PARAMETERS))
-    summary = FIT_FILE.read(run / FIT, _check_numbers)
+    summary = load_record(run)
     _check_toml_format(run / EXPERIMENT)
     experiment = experiment_files.load_experiment(run / EXPERIMENT)
     if "distances" not in summary:  # of an earlier release, with its defaults
@@ -156,14 +166,13 @@ def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
     _check_files(run, (PARAMETERS,))
     path = run / PARAMETERS
     if (run / FIT).exists() or (run / SEARCH).exists():  # without both, the parameters came alone
-        _check_files(run, (FIT,))
-        _check_has_parameters(path, FIT_FILE.read(run / FIT, _check_numbers))
+        _check_has_parameters(path, load_record(run))
     _check_toml_format(path)
     ik, _ = parameter_files.load_system(path, rig)
     return ik
 
 
-def _check_has_parameters(path: Path, summary: FitSummary) -> None:
+def _check_has_parameters(path: Path, summary: FitRecord) -> None:
     """Raises ValueError for the parameters of another fit."""
     present = flatten(read_toml(path, "a parameter"), 2)
     names = {
@@ -187,7 +196,7 @@ def _check_files(run: Path, names: Sequence[str]) -> None:
             raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
 
 
-def _check_numbers(summary: FitSummary) -> None:
+def _check_numbers(summary: FitRecord) -> None:
     """Raises ValueError where the numbers of a fit contradict each other."""
     if "noise" in summary:
         NoiseModel(**summary["noise"])  # checks its numbers

@@ -40,7 +40,7 @@ from fitting.report.formatting import Table, counted, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Effort, Stopwatch, first_alone, waiting_for
-from fitting.runtime.json_files import Finite, JsonFile
+from fitting.runtime.json_files import JsonFile
 from fitting.runtime.plain_tree import NotPlainError
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import program_key
@@ -49,7 +49,7 @@ from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
 from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
-from fitting.studies.fit.fit import Fit, Interval
+from fitting.studies.fit.fit import Fit, FitRecord, FittedParameter
 from fitting.studies.fit.fit_jobs import fit
 from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
@@ -67,6 +67,11 @@ ROW = "row.json"
 CSV, PARQUET = "fits.csv", "fits.parquet"
 MISSING = f"no {PARQUET}, as pyarrow is not installed: pip install 'jaxik[parquet]'"
 Cells: TypeAlias = dict[str, Any]  # by column
+OF_SEARCH = {
+    "converged": "converged", "cost_before": "cost_before", "cost": "cost", "starts": "starts",
+    "agreeing": "agreeing", "steps": "steps", "search_seconds": "seconds",
+}  # fmt: skip
+"""Keys of a search's record by column."""
 OUTCOME = (
     "converged", "fits", "verdict", "cost_before", "cost", "starts", "agreeing", "steps",
     "search_seconds", "frames",
@@ -207,35 +212,6 @@ def _digest_of_state(path: Path, size: int, changed: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-class FittedValue(TypedDict):
-    """What a fit says of a parameter."""
-
-    value: Finite
-    unit: str
-    interval: Interval
-    """95 %."""
-    determined: bool
-
-
-class Outcome(TypedDict):
-    """What a fit found."""
-
-    converged: bool
-    fits: bool
-    verdict: str
-    """One sentence."""
-    cost_before: Finite
-    cost: Finite
-    starts: int
-    agreeing: int
-    steps: int
-    search_seconds: float
-    """Of the effort; all else prepares and assesses."""
-    frames: int
-    """Of its clips."""
-    parameters: dict[str, FittedValue]
-
-
 class Row(TypedDict):
     """A fit that was tried."""
 
@@ -250,40 +226,16 @@ class Row(TypedDict):
     identity: str
     notes: list[str]
     """Warnings."""
-    outcome: NotRequired[Outcome]
+    frames: NotRequired[int]
+    """Of its clips."""
     effort: NotRequired[Effort]
+    fit: NotRequired[FitRecord]
+    """As its run folder has it, but for the history; the row's own file has none."""
 
 
 ROW_FILE = JsonFile(
     Row, "written by `jaxik fit-many`", "delete it to fit anew, or name another folder"
 )
-
-
-def outcome_of(fitted: Fit) -> Outcome:
-    """What a finished fit found."""
-    summary = fitted.summary
-    parameters: dict[str, FittedValue] = {
-        row["name"]: {
-            "value": row["value"],
-            "unit": row["unit"],
-            "interval": row["interval"],
-            "determined": row["determined"],
-        }
-        for row in summary["parameters"]
-    }
-    return {
-        "converged": summary["converged"],
-        "fits": summary["goodness"]["fits"],
-        "verdict": summary["goodness"]["sentence"],
-        "cost_before": summary["cost_before"],
-        "cost": summary["cost"],
-        "starts": summary["starts"],
-        "agreeing": summary["agreeing"],
-        "steps": summary["steps"],
-        "search_seconds": summary["seconds"],
-        "frames": sum(scene.frames.dt.shape[0] for scene in fitted.problem.data),
-        "parameters": parameters,
-    }
 
 
 def make_row(task: FitTask, error: str = "") -> Row:
@@ -304,12 +256,21 @@ def read_row(folder: Path, task: FitTask) -> Row | None:
     """The row of a fit that is whole already, in the folder of all fits; None if there is none.
 
     Raises:
-        ValueError: the folder has the fit of an experiment that was changed since.
+        ValueError: the folder has the fit of an experiment that was changed since, or it is
+            damaged.
     """
     name = f"{task.run / ROW}"
     if not (folder / name).is_file():
         return None  # without the identity, which takes reading all of the clips
-    return row_store(folder).read(name, {"identity": task.identity()})
+    row = row_store(folder).read(name, {"identity": task.identity()})
+    if row is not None:
+        row["fit"] = _in_brief(run_folder.load_record(folder / task.run))
+    return row
+
+
+def _in_brief(record: FitRecord) -> FitRecord:
+    """The record without its history, which would fill the memory with thousands of fits."""
+    return {**record, "history": []}
 
 
 def row_store(folder: Path) -> Store[Row]:
@@ -344,9 +305,9 @@ class ManyFits:
         return [row for row in self.rows if row["state"] == "failed"]
 
     @property
-    def outcomes(self) -> dict[str, Outcome]:
-        """What finished fits found, by run."""
-        return {row["run"]: row["outcome"] for row in self.rows if "outcome" in row}
+    def records(self) -> dict[str, FitRecord]:
+        """Of finished fits, by run."""
+        return {row["run"]: row["fit"] for row in self.rows if "fit" in row}
 
     @property
     def efforts(self) -> list[Effort]:
@@ -356,18 +317,18 @@ class ManyFits:
     @property
     def unconverged(self) -> list[str]:
         """The runs of finished fits whose search has not converged."""
-        return [run for run, outcome in self.outcomes.items() if not outcome["converged"]]
+        return [run for run, record in self.records.items() if not record["converged"]]
 
     @property
     def misfits(self) -> int:
         """How many finished fits leave more of the motion over than noise of the given sigmas."""
-        return sum(not outcome["fits"] for outcome in self.outcomes.values())
+        return sum(not record["goodness"]["fits"] for record in self.records.values())
 
 
 def columns(rows: Sequence[Row]) -> list[str]:
     """The names of all columns; those of parameters last, in the order in which they appear."""
     parameters = dict.fromkeys(
-        name for row in rows if "outcome" in row for name in row["outcome"]["parameters"]
+        fitted["name"] for row in rows if "fit" in row for fitted in row["fit"]["parameters"]
     )
     each = [f"{name}{ending}" for name in parameters for ending in ("", ".low", ".high", ".known")]
     return [*WHAT, "notes", *OUTCOME, *EFFORT, *each]
@@ -380,11 +341,13 @@ def cells(row: Row) -> Cells:
     clip determines it.
     """
     content: Cells = {key: row[key] for key in WHAT} | {"notes": "; ".join(row["notes"])}
-    if "outcome" in row:
-        outcome = row["outcome"]
-        content |= {key: outcome[key] for key in OUTCOME}
-        for name, fitted in outcome["parameters"].items():
-            low, high = fitted["interval"]
+    if "fit" in row:
+        record = row["fit"]
+        content |= {column: record[key] for column, key in OF_SEARCH.items()}
+        content |= {"fits": record["goodness"]["fits"], "verdict": record["goodness"]["sentence"]}
+        content["frames"] = row.get("frames")
+        for fitted in record["parameters"]:
+            name, (low, high) = fitted["name"], fitted["interval"]
             content |= {name: fitted["value"], f"{name}.low": low, f"{name}.high": high}
             content[f"{name}.known"] = fitted["determined"]
     if "effort" in row:
@@ -568,9 +531,11 @@ def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
             fitted = _fit(run, task.experiment, report, watch)
         row = make_row(task)
         row["notes"] = list(dict.fromkeys(in_one_line(Warning(note.message)) for note in caught))
-        row["outcome"], row["effort"] = outcome_of(fitted), watch.read()
+        row["frames"] = sum(scene.frames.dt.shape[0] for scene in fitted.problem.data)
+        row["effort"] = watch.read()
         (run / ERROR).unlink(missing_ok=True)
         row_store(folder).write(f"{row['run']}/{ROW}", row)
+        row["fit"] = _in_brief(fitted.summary)
         return row
     except Exception as error:
         if not isinstance(error, ValueError | OSError):  # which are told in a sentence
@@ -623,12 +588,12 @@ def plan_line(experiments: int, tasks: int, missing: int, seeds: int) -> str:
 
 def row_line(row: Row) -> str:
     """A fit that ended, in one line."""
-    if "outcome" not in row:
+    if "fit" not in row:
         return f"{row['run']}: FAILED: {row['error']}"
-    outcome = row["outcome"]
-    state = "" if outcome["converged"] else ", not converged"
+    record = row["fit"]
+    state = "" if record["converged"] else ", not converged"
     seconds = f", {row['effort']['seconds']:.1f} s" if "effort" in row else ""
-    return f"{row['run']}: cost {number(outcome['cost'])}{seconds}{state}"
+    return f"{row['run']}: cost {number(record['cost'])}{seconds}{state}"
 
 
 def parameter_table(fits: ManyFits) -> Table:
@@ -665,15 +630,15 @@ def fit_table(fits: ManyFits) -> Table:
     """A row for each fit; of very many the first ones."""
     rows = [["run", "state", "cost", "determined", "seconds"]]
     for row in fits.rows[:MANY]:
-        if "outcome" not in row:
+        if "fit" not in row:
             rows.append([row["run"], "failed!", "–", "–", "–"])
             continue
-        outcome = row["outcome"]
-        known = sum(fitted["determined"] for fitted in outcome["parameters"].values())
-        state = "converged" if outcome["converged"] else "not converged!"
+        record = row["fit"]
+        known = sum(fitted["determined"] for fitted in record["parameters"])
+        state = "converged" if record["converged"] else "not converged!"
         seconds = f"{row['effort']['seconds']:.1f}" if "effort" in row else "–"
-        count = f"{known} of {len(outcome['parameters'])}"
-        rows.append([row["run"], state, number(outcome["cost"]), count, seconds])
+        count = f"{known} of {len(record['parameters'])}"
+        rows.append([row["run"], state, number(record["cost"]), count, seconds])
     if len(fits.rows) > MANY:
         rows.append([f"and {len(fits.rows) - MANY} others", "", "", "", ""])
     return rows
@@ -732,17 +697,16 @@ def overview(fits: ManyFits, title: str) -> Figure:
     return figure
 
 
-def _by_parameter(fits: ManyFits) -> dict[tuple[str, str], list[FittedValue]]:
+def _by_parameter(fits: ManyFits) -> dict[tuple[str, str], list[FittedParameter]]:
     """What fits say of each parameter of each experiment."""
-    series: dict[tuple[str, str], list[FittedValue]] = {}
-    outcomes = fits.outcomes
+    series: dict[tuple[str, str], list[FittedParameter]] = {}
     for row in fits.finished:
-        for name, fitted in outcomes[row["run"]]["parameters"].items():
-            series.setdefault((row["experiment"], name), []).append(fitted)
+        for fitted in row["fit"]["parameters"] if "fit" in row else ():
+            series.setdefault((row["experiment"], fitted["name"]), []).append(fitted)
     return series
 
 
-def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
+def _values(axes: Axes, values: Sequence[FittedParameter]) -> None:
     """Each fit's value with its 95 % interval, or a histogram of very many."""
     unit = values[0]["unit"]
     if len(values) > SINGLE:
@@ -762,7 +726,7 @@ def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
 def _seconds(axes: Axes, fits: ManyFits) -> None:
     """How long fits took, and how much of that was their search."""
     whole = np.array([effort["seconds"] for effort in fits.efforts])
-    search = np.array([outcome["search_seconds"] for outcome in fits.outcomes.values()])
+    search = np.array([record["seconds"] for record in fits.records.values()])
     # Logarithmic, for first fits compile and take a hundred times as long as those that follow.
     ends = min(whole.min(), search.min()), max(whole.max(), search.max())
     bins = np.geomspace(max(ends[0], SHORTEST) / 1.1, max(ends[1], SHORTEST) * 1.1, 30).tolist()
@@ -815,11 +779,11 @@ def _completeness(fits: ManyFits) -> Finding:
 
 
 def _convergence(fits: ManyFits) -> Finding:
-    outcomes = fits.outcomes
-    if not outcomes:
+    count = len(fits.records)
+    if not count:
         return Finding("No fit is finished, so nothing was found.", bad=True)
     bad = fits.misfits
-    text = f"{len(outcomes) - bad} of {len(outcomes)} match the motion to within the given sigmas"
+    text = f"{count - bad} of {count} match the motion to within the given sigmas"
     if fits.unconverged:
         runs = listed(fits.unconverged)
         return Finding(f"{len(fits.unconverged)} did not converge ({runs}); {text}.", bad=True)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, NotRequired, TypedDict
+from typing import NamedTuple, TypedDict
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from fitting.inference.mixed_model import (
     fit_population,
     model_around,
 )
-from fitting.inference.noise import NoiseModel, NoiseOptions, noise_of, with_noise
+from fitting.inference.noise import NoiseModel, NoiseOptions, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.motion.accuracy import position_error
 from fitting.problem.problem import Problem
@@ -50,10 +50,10 @@ from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
-from fitting.runtime.validation import Content
 from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.assess import search_identity, search_with_noise
+from fitting.studies.fit.fit import SearchRecord, record_search
 from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 from jaxik.maths import parameter_tree
@@ -91,18 +91,12 @@ COLOURS = dict(zip(ERROR_NAMES, (BEFORE, CAPTURED, AFTER, STAGES[1], STAGES[4]),
 PANELS_PER_ROW = 3
 
 
-class SearchResult(TypedDict):
-    """What a search has found, as its file holds it."""
+class SearchResult(SearchRecord):
+    """The result of a search, as its file holds it."""
 
     name: str
     """What was fitted."""
     u: list[Finite]
-    cost: Finite
-    converged: bool
-    message: str
-    seconds: float
-    noise: NotRequired[Annotated[Content, NoiseModel]]
-    """Where it was estimated."""
 
 
 RESULT_FILE = JsonFile(
@@ -159,17 +153,8 @@ def _search(task: SearchTask) -> SearchResult:
         fitted, solution = search_with_noise(task.problem, task.experiment)
     if solution.interrupted:
         raise KeyboardInterrupt
-    result: SearchResult = {
-        "name": task.name,
-        "u": solution.u.tolist(),
-        "cost": solution.cost,
-        "converged": solution.converged,
-        "message": solution.message,
-        "seconds": solution.seconds,
-    }
-    if task.experiment.noise.estimates_any:
-        result["noise"] = dataclasses.asdict(noise_of(fitted))
-    return result
+    record = record_search(task.experiment, fitted, solution)
+    return {"name": task.name, "u": solution.u.tolist(), **record}
 
 
 def result_line(result: SearchResult) -> str:
