@@ -390,11 +390,11 @@ def test_the_exit_status_says_what_is_wrong_with_a_fit(done, tmp_path, monkeypat
         (7, False, False, True, False, 1),
         (130, True, False, True, False, 1),
     ):
-        found = SimpleNamespace(interrupted=interrupted, converged=converged)
-        verdict = SimpleNamespace(fits=fits)
-        distances = SimpleNamespace(setbacks=[None] * setbacks)
-        parts = {"solution": found, "verdict": verdict, "distances": distances}
-        fitted = SimpleNamespace(has_noise=has_noise, **parts)
+        ended = {"interrupted": interrupted, "converged": converged}
+        solution = dataclasses.replace(done.fitted.solution, **ended)
+        fitted = dataclasses.replace(done.fitted, solution=solution, has_noise=has_noise)
+        vars(fitted)["verdict"] = SimpleNamespace(fits=fits)
+        vars(fitted)["distances"] = SimpleNamespace(setbacks=[None] * setbacks)
         monkeypatch.setattr(jobs, "fit", lambda *_, fitted=fitted, **__: fitted)
         assert main.main(["fit", str(done.experiment), "-o", str(tmp_path)]) == status
 

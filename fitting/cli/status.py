@@ -23,10 +23,8 @@ def of_job(*, interrupted: bool) -> int:
 
 def of_fit(fitted: "Fit") -> int:
     """The exit status of a search; what a translation leaves over is a result, and no failure."""
-    from fitting.studies.fit.sentences import is_worse
-
     of_job(interrupted=fitted.solution.interrupted)
-    if is_worse(fitted):
+    if fitted.is_worse:
         return WORSE
     if not fitted.solution.converged:
         return NOT_CONVERGED

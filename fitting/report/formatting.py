@@ -15,6 +15,7 @@ Table: TypeAlias = list[list[str]]  # rows of cells, the heading first
 
 NARROWEST = 28  # characters of prose beside the other columns; else it goes below them
 INDENT = "    "
+NAMED = 3  # names of a list in a sentence, which are all given if there are no more
 
 
 class TableText(str):
@@ -80,6 +81,13 @@ def interval(low: float, high: float) -> str:
 def bullets(lines: Sequence[str]) -> str:
     """A Markdown list."""
     return "\n".join(f"- {line}" for line in lines)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence; of many only the first."""
+    if len(names) > NAMED:
+        return f"{', '.join(names[: NAMED - 1])} and {len(names) - NAMED + 1} others"
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def aligned(table: Table) -> TableText:

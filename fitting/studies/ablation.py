@@ -48,7 +48,7 @@ from fitting.report.document import (
     Terms,
     Text,
 )
-from fitting.report.formatting import Table, meanings, number, transposed
+from fitting.report.formatting import Table, listed, meanings, number, transposed
 from fitting.report.style import AFTER, CAPTURED, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
@@ -60,7 +60,6 @@ from jaxik.world.similarity import similar
 from .animations import Animation
 from .campaign import Campaign
 from .fit.assess import search_with_noise
-from .fit.sentences import listed
 from .output import output_folder, publish
 
 NUMBERS = "contribution.json"

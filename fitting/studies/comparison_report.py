@@ -28,7 +28,7 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import Table, figures_table, meanings, percent, transposed
+from fitting.report.formatting import Table, figures_table, listed, meanings, percent, transposed
 from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
 from fitting.report.style import (
     BEFORE,
@@ -45,7 +45,6 @@ from fitting.runtime.precision import in_float64
 
 from .animations import JOINTS
 from .comparison import ANIMATED, Comparison, worst_seconds
-from .fit.sentences import listed
 
 TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
 RATES = (

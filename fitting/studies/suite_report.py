@@ -22,14 +22,13 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import Table, meanings
+from fitting.report.formatting import Table, listed, meanings
 from fitting.report.style import BEFORE, EARTH, GROUND, STAGES, earth, legend, styled
 from fitting.runtime.precision import in_float64
 
 from . import comparison_report
 from .comparison import ANIMATED
 from .comparison_report import BOUND, MARKED, MISS
-from .fit.sentences import listed
 from .suite import Scene, Suite
 
 TABLE, NUMBERS, PAGE = "suite.md", "suite.json", "suite.png"

@@ -35,10 +35,10 @@ from fitting.report import document, pages
 from fitting.report.document import Grid, Section, Text
 from fitting.report.formatting import markdown
 from fitting.runtime import display
-from fitting.studies.fit import fit_report, goodness_report, run_folder, sentences
+from fitting.studies.fit import fit_report, goodness_report, identifiability_report, run_folder
 from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import posterior_plots, posterior_report, prior_report
+from fitting.studies.sample import posterior_plots, posterior_report
 from fitting.studies.sample.sample import SampledFit
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
@@ -167,7 +167,7 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
 
 def test_what_the_fit_has_made_worse_is_the_first_sentence(fitted):
     text = fit_report.fit_text(fitted)
-    assert ("Worse" in text) == bool(fitted.distances.setbacks) == sentences.is_worse(fitted)
+    assert ("Worse" in text) == bool(fitted.distances.setbacks) == fitted.is_worse
     worse, tolerated = replace(fitted), replace(fitted, has_noise=False)
     near, far = dict.fromkeys(goodness.CLOSE, 0.001), dict.fromkeys(goodness.CLOSE, 0.019)
     motions: Any = {"animation": near, "before": near, "fitted": far}
@@ -190,14 +190,14 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert centre is not None and centre == pytest.approx(planted["before"])
     u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
     np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
-    text = "\n".join(document.markdown([prior_report.prior_section(rows)]))
+    text = "\n".join(document.markdown([identifiability_report.prior_section(rows)]))
     low, high = planted["prior"]["interval"]
     assert line_of(text, "contact.planted_height") == (
         f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
         "| 0.1 to 0.12 |"
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
-    section = prior_report.prior_section(fitted.summary["parameters"])
+    section = identifiability_report.prior_section(fitted.summary["parameters"])
     text = "\n".join(document.markdown([section]))
     assert "| normal | 0.9667 (system: 1) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")

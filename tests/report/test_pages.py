@@ -30,7 +30,6 @@ from fitting.studies.fit import (
     fit_plots,
     fit_report,
     identifiability_report,
-    sentences,
 )
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import run_comparison
@@ -405,7 +404,7 @@ def test_a_run_keeps_its_flat_animation_and_its_fitted_motion(run, fitted):
 
 
 def test_many_names_become_a_number_and_data_cannot_end_its_script_element():
-    texts = [sentences.listed(list("abcd"[:count])) for count in (1, 2, 3, 4)]
+    texts = [formatting.listed(list("abcd"[:count])) for count in (1, 2, 3, 4)]
     assert texts == ["a", "a and b", "a, b and c", "a, b and 2 others"]
     assert "<" not in pages.as_json({"a": "</script><!--"})
     with pytest.raises(ValueError, match="JSON"):

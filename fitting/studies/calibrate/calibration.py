@@ -26,12 +26,11 @@ from fitting.inference.proportions import Proportion, RankTest, proportion
 from fitting.problem.problem import Problem
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, counted, percent
+from fitting.report.formatting import Table, counted, listed, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, panels, styled
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
 from fitting.runtime.precision import in_float64
-from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 
 from .replicates import (

@@ -380,6 +380,11 @@ class Fit(Shown):
         return goodness.judge_tolerances(self.groups)
 
     @property
+    def is_worse(self) -> bool:
+        """Whether it is visibly further from a capture than what there was before it."""
+        return self.has_noise and bool(self.distances.setbacks)
+
+    @property
     def clips_as_fitted(self) -> tuple[ClipData, ...]:
         """The clips, on their ground as the fitted capture takes it."""
         pairs = zip(self.clips, self.scenes, strict=False)

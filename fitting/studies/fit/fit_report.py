@@ -1,5 +1,6 @@
 """The report of a fit: what it found, with its plots and its motions."""
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.clips import flight
 from fitting.motion import playback, worst_window
+from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import Measures
 from fitting.motion.playback import ClipActivity, Nudge, Playback
 from fitting.motion.worst_window import WorstWindow
@@ -30,22 +32,19 @@ from fitting.report.document import (
     Text,
     View,
 )
-from fitting.report.formatting import Table, figures_table
+from fitting.report.formatting import Table, figures_table, listed, percent
 from fitting.report.motion_data import ShownClip, ShownMotion
 from fitting.runtime import activity
 from fitting.runtime.beside import calls_beside
 from fitting.runtime.precision import in_float64
-from fitting.studies.sample import prior_report
 from jaxik.maths import parameter_tree
 
 from . import (
-    fit_figures,
     fit_motions,
     fit_plots,
     fit_tables,
     goodness_report,
     identifiability_report,
-    sentences,
 )
 from .assess import MIN_IMPROVEMENT
 from .fit import Fit, FittedParameter
@@ -140,15 +139,15 @@ def fit_document(
         sections += [_worst(fitted), *_determined(fitted, measured.activities)]
         sections += [_activity(measured), _limits(fitted, measured.activities)]
     closing = [summary["message"], cost_sentence(fitted)]
-    if not sentences.is_worse(fitted):
+    if not fitted.is_worse:
         closing.insert(0, fitted.verdict.sentence)
     return Document(
         file=SUMMARY,
         kind="Foot IK fitted to captured motion",
         title=fitted.experiment.name,
-        verdict=sentences.verdict_word(fitted),
+        verdict=_verdict(fitted),
         good=summary["converged"] and fitted.verdict.fits,
-        findings=[Finding(sentence) for sentence in sentences.findings(fitted, motions)],
+        findings=[Finding(sentence) for sentence in _findings(fitted, motions)],
         sections=[*sections, *details],
         asked=_asked(fitted),
         files={FIT: "all numbers", PARAMETERS: "the fitted system"},
@@ -254,7 +253,7 @@ def _draw_search(run: Path, fitted: Fit) -> list[Plot]:
 def _ranges(fitted: Fit, parameters: Sequence[FittedParameter], label: str) -> Ranges:
     space, truth = fitted.problem.space, fitted.known_values
     docs = parameter_tree.docs(space.system)
-    rows = fit_figures.parameter_rows(
+    rows = fit_tables.parameter_rows(
         parameters,
         {parameter.name: parameter.scale for parameter in space.parameters},
         {parameter.name: docs.get(parameter.leaf, "") for parameter in space.parameters},
@@ -327,13 +326,13 @@ def _determined(fitted: Fit, activities: Sequence[ClipActivity]) -> list[Section
         return []
     blocks = identifiability_report.determined_blocks(fitted, len(activities))
     return [
-        prior_report.prior_section(fitted.summary["parameters"]),
+        identifiability_report.prior_section(fitted.summary["parameters"]),
         Section("What these clips determine", blocks, on_page=False),
     ]
 
 
 def _activity(measured: Measured) -> Section:
-    limits, idle = fit_figures.limit_table(measured.activities)
+    limits, idle = fit_tables.limit_table(measured.activities)
     flips = fit_tables.flip_table(measured.nudges)
     blocks: list[Block] = [
         Text("Fraction of all frames, for each foot:"),
@@ -410,3 +409,81 @@ def _remarks(fitted: Fit) -> list[str]:
         if in_the_air := flight.describe(clip.base):
             remarks.append(f"{name}: {in_the_air}.")
     return remarks
+
+
+def _findings(fitted: Fit, motions: Sequence[ClipMotions]) -> list[str]:
+    """How close the motion is, what is determined, and how the feet stand: a sentence each.
+
+    What the fit has made worse comes first. Without the motions, the rest is what is determined.
+    """
+    worse = [fitted.verdict.sentence] if fitted.is_worse else []
+    if not motions:
+        return [*worse, _open_parameters(fitted)]
+    closeness = _closeness(fitted, fit_motions.summarised(motions))
+    return [*worse, closeness, _open_parameters(fitted), _feet(motions)]
+
+
+def _verdict(fitted: Fit) -> str:
+    """The verdict in two or three words."""
+    if fitted.is_worse:
+        return "Worse"
+    if not fitted.summary["converged"]:
+        return "Not converged"
+    if fitted.has_noise:
+        return "Fits" if fitted.verdict.fits else "Does not fit"
+    return "The same motion" if fitted.verdict.fits else "Not the same motion"
+
+
+def _closeness(fitted: Fit, accuracies: Mapping[str, Accuracy]) -> str:
+    before, after = (_centimetres(accuracies[name].ankle) for name in ("before", "fitted"))
+    whose = "the captured ones" if fitted.has_noise else "those of the source"
+    figures = f"its ankles are {after} from {whose} (root mean square), {before} before the fit"
+    if not fitted.summary["converged"]:
+        return f"The search did not settle on one solution; in the best that it met, {figures}."
+    motion = "captured motion" if fitted.has_noise else "source's motion"
+    if fitted.verdict.fits:
+        degree = "as closely as its noise allows" if fitted.has_noise else "within the tolerances"
+        return f"The fitted system reproduces the {motion} {degree}: {figures}."
+    return f"The fitted system does not reproduce the whole {motion}: {figures}."
+
+
+def _open_parameters(fitted: Fit) -> str:
+    rows = fitted.summary["parameters"]
+    if not rows:
+        return "No parameter was fitted: this is the system as it comes."
+    names = [row["name"] for row in rows if not row["determined"]]
+    count = len(rows) - len(names)
+    if not names:
+        every = "the parameter" if len(rows) == 1 else f"all {len(rows)} parameters"
+        return f"The clips determine {every}."
+    left = f"{listed(names)} {'stays' if len(names) == 1 else 'stay'} open"
+    return f"The clips determine {count} of {len(rows)} parameters; {left}."
+
+
+def _feet(motions: Sequence[ClipMotions]) -> str:
+    before, after, captured = (
+        [getattr(clip, name).measures for clip in motions]
+        for name in ("before", "fitted", "captured")
+    )
+    shares = [
+        max((m.penetration_stance for m in each), key=_known) for each in (before, after, captured)
+    ]
+    if math.isnan(shares[1]):
+        return "No standing foot has ground under it, so nothing can be said of feet in the ground."
+    visible = f"{100 * motions[0].fitted.measures.visible:.2g} cm"
+    where = " of the worst clip" if len(motions) > 1 else ""
+    text = (
+        f"Standing feet are {visible} or more in the ground in {percent(shares[1])} of their "
+        f"frames{where}, {percent(shares[0])} before the fit"
+    )
+    if not math.isnan(shares[2]):
+        text += f" and {percent(shares[2])} as captured"
+    return f"{text}."
+
+
+def _known(share: float) -> float:
+    return -1.0 if math.isnan(share) else share
+
+
+def _centimetres(length: float) -> str:
+    return "an unknown distance" if math.isnan(length) else f"{100 * length:.1f} cm"

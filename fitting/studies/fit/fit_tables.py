@@ -1,13 +1,16 @@
-"""Tables of a fit: its parameters, and how well the clips determine them."""
+"""Tables of a fit: its parameters, how well the clips determine them, and its motions."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from fitting.motion.playback import ClipActivity, Nudge
+from fitting.report.document import ParameterRow
 from fitting.report.formatting import Table, interval, number, percent
 
 from .fit import FittedParameter
 
+NO_CORRECTION = ("bone_length",)  # figures that say nothing of how close two motions are
 CLOSE = 0.05  # fraction of its range within which a parameter counts as recovered
 Truth: TypeAlias = Mapping[str, float] | None  # known parameter values by name
 
@@ -100,3 +103,65 @@ def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
             cells += [percent(nudge.flipped, 2), f"{nudge.rise:+.1f}"]
         table.append(cells)
     return table
+
+
+def parameter_rows(
+    rows: Sequence[FittedParameter],
+    scales: Mapping[str, str],
+    docs: Mapping[str, str],
+    truth: Truth,
+) -> list[ParameterRow]:
+    """The free parameters.
+
+    Args:
+        rows: their numbers.
+        scales: by name, on which the range is drawn; all but `log` are linear.
+        docs: by name, what they mean.
+        truth: known values, by name.
+    """
+    return [_parameter_row(row, scales[row["name"]], docs[row["name"]], truth) for row in rows]
+
+
+def _parameter_row(row: FittedParameter, scale: str, doc: str, truth: Truth) -> ParameterRow:
+    low, high = row["low"], row["high"]
+
+    def fraction(value: float) -> float:
+        value = min(max(value, low), high)
+        if scale == "log" and low > 0:
+            return math.log(value / low) / math.log(high / low)
+        return (value - low) / (high - low)
+
+    true = None if truth is None else truth.get(row["name"])
+    unit = "" if row["unit"] == "1" else row["unit"]
+    words = verdict(row)
+    if row["at_bound"]:
+        words += f", at its {'lower' if row['at_bound'] == 'low' else 'upper'} bound"
+    return ParameterRow(
+        name=row["name"],
+        meaning=doc,
+        value=number(row["value"]),
+        unit=unit,
+        interval=interval(*row["interval"]),
+        range=interval(low, high),
+        verdict=words,
+        determined=row["determined"],
+        at=fraction(row["value"]),
+        low=fraction(row["interval"][0]),
+        high=fraction(row["interval"][1]),
+        before=fraction(row["before"]) if math.isfinite(row["before"]) else None,
+        truth=None if true is None else fraction(true),
+        description=(
+            f"{row['name']}: {number(row['value'])} {unit}, 95 % interval "
+            f"{interval(*row['interval'])}, in the range {interval(low, high)}"
+            + ("" if true is None else f", true value {number(true)}")
+        ),
+    )
+
+
+def limit_table(clips: Sequence[ClipActivity]) -> tuple[Table, list[str]]:
+    """In which fraction of frames limits change the pose, by clip; names of those that never do."""
+    names = [f"clip {i + 1}" for i in range(len(clips))] if len(clips) > 1 else ["frames"]
+    idle = [name for name in clips[0].limits if not any(clip.limits[name] for clip in clips)]
+    active = [name for name in clips[0].limits if name not in idle]
+    rows = [[name, *(percent(clip.limits[name]) for clip in clips)] for name in active]
+    return [["limit", *names], *rows], idle

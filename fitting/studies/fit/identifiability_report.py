@@ -7,7 +7,7 @@ import numpy as np
 from fitting.motion.evidence import Evidence, describe_missing_motion, find_evidence
 from fitting.motion.playback import ClipActivity, Playback
 from fitting.motion.worst_window import WorstWindow
-from fitting.report.document import Block, Grid, Points, Text
+from fitting.report.document import Block, Grid, Points, Section, Text
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 from fitting.runtime import activity
 from jaxik.maths import parameter_tree
@@ -87,6 +87,40 @@ def verdict_table(rows: Sequence[FittedParameter]) -> Table:
         several = "; ".join(valleys) if len(valleys) > 1 else ""
         table.append([*cells, f"{row['contraction']:.3f}", several])
     return table
+
+
+def prior_section(rows: Sequence[FittedParameter]) -> Section:
+    """What a prior is, and the table of them."""
+    explanation = (
+        "What was known of the parameters before these clips, beside what the fit leaves of it. A "
+        "normal prior is one of `u`, the parameter's range stretched to a coordinate without "
+        "bounds; the spread is its standard deviation there. Unless the experiment says otherwise, "
+        "it is centred at the system's value, or, where that is in the outer sixth of the range, a "
+        "sixth inside. A uniform prior is the range itself."
+    )
+    grid = Grid(prior_table(rows), "Priors", brief=False)
+    return Section("Priors", [Text(explanation), grid], on_page=False)
+
+
+def prior_table(rows: Sequence[FittedParameter]) -> Table:
+    """Free parameters: shape, centre and spread of the prior, its interval and the fit's."""
+    table = [["parameter", "unit", "prior", "centre", "spread of u"]]
+    table[0] += ["95 % of the prior", "95 % interval of the fit"]
+    for row in rows:
+        prior = row["prior"]
+        cells = [row["name"], row["unit"], prior["shape"], _centre(row)]
+        cells.append("" if prior["spread"] is None else number(prior["spread"]))
+        table.append([*cells, interval(*prior["interval"]), interval(*row["interval"])])
+    return table
+
+
+def _centre(row: FittedParameter) -> str:
+    """The centre of a prior, and the system's value where it is another one."""
+    centre = row["prior"]["centre"]
+    if centre is None:
+        return ""
+    other = number(row["before"]) != number(centre)
+    return number(centre) + (f" (system: {number(row['before'])})" if other else "")
 
 
 def missing_motion(fitted: Fit, clips: Sequence[ClipActivity]) -> list[list[str]]:

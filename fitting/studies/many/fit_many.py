@@ -36,7 +36,7 @@ from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import LoadedExperiment
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, counted, number, percent
+from fitting.report.formatting import Table, counted, listed, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Effort, Stopwatch, first_alone, waiting_for
@@ -51,7 +51,6 @@ from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit, FitRecord, FittedParameter
 from fitting.studies.fit.fit_jobs import fit
-from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, counted, interval, number
+from fitting.report.formatting import Table, counted, interval, listed, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
@@ -54,7 +54,6 @@ from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.assess import search_identity, search_with_noise
 from fitting.studies.fit.fit import SearchRecord, record_search
-from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 from jaxik.maths import parameter_tree
 

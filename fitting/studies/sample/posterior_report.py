@@ -14,6 +14,7 @@ from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOn
 from fitting.inference.sample.diagnostics import ParameterSummary
 from fitting.inference.sample.modes import MIN_EXCHANGES, Island
 from fitting.inference.sample.posterior import Posterior
+from fitting.inference.sample.prior_sensitivity import MAX_K, Reweighted
 from fitting.problem.space import Space
 from fitting.report import document, pages
 from fitting.report.document import (
@@ -37,7 +38,6 @@ from fitting.studies.fit.run_folder import LOWER_POINT
 
 from . import posterior_plots
 from .predictive import SURPRISING, Band, Disagreement, PredictiveCheck, Statistic
-from .prior_report import posterior_prior_blocks
 from .replay import Replay
 from .sample import SampledFit
 
@@ -455,3 +455,59 @@ def _cells(statistic: Statistic) -> list[str]:
     low, high = statistic.replicated_interval
     mark = "!" if statistic.is_surprising else ""
     return [f"{statistic.median:.3g}", f"{low:.3g} to {high:.3g}", f"{statistic.p:.3f}{mark}"]
+
+
+def posterior_prior_blocks(sampled: SampledFit, units: Mapping[str, str]) -> list[Block]:
+    """Prior beside posterior, and how much the one decides the other."""
+    sensitivity = sampled.prior_sensitivity.items()
+    moved = [name for name, rows in sensitivity if any(row["sensitive"] for row in rows)]
+    unknown = [
+        name
+        for name, rows in sensitivity
+        if name not in moved and any(row["sensitive"] is None for row in rows)
+    ]
+    table = prior_and_posterior_table(sampled, units)
+    sentences = []
+    if moved:
+        sentences.append(
+            f"Sensitive to their prior, for an end of the interval moves by more than a quarter of "
+            f"its width: {_names(moved)}."
+        )
+    if unknown:
+        sentences.append(
+            f"The draws cannot tell how sensitive these are; sample with another `[prior]` to see: "
+            f"{_names(unknown)}."
+        )
+    return [
+        Heading("Prior and posterior"),
+        Text(
+            "The last columns are the median and the 95 % interval if the parameter's own prior "
+            "had half or twice the spread in `u`, by weighting the draws. `k` is the Pareto shape "
+            f"of the weights; above {MAX_K:g} they are unreliable, and no figure is given."
+        ),
+        Grid(table, "Prior and posterior", brief=False),
+        *map(Text, sentences or ["No parameter is sensitive to its prior."]),
+    ]
+
+
+def prior_and_posterior_table(sampled: SampledFit, units: Mapping[str, str]) -> Table:
+    """Free parameters: intervals of the prior, of the posterior, and under other priors."""
+    table = [["parameter", "unit", "prior", "95 % of the prior", "95 % of the posterior"]]
+    table[0] += ["with half the spread", "with twice the spread"]
+    for row in sampled.posterior.summary:
+        name = row["name"]
+        prior = sampled.priors[name]
+        cells = [name, units[name], prior["shape"], interval(*prior["interval"])]
+        cells.append(interval(row["low95"], row["high95"]))
+        table.append([*cells, *map(_reweighted, sampled.prior_sensitivity[name])])
+    return table
+
+
+def _reweighted(row: Reweighted) -> str:
+    if row["median"] is None or row["interval"] is None:
+        return f"unreliable (k {row['pareto_k']:.2f})"
+    return f"{number(row['median'])}, {interval(*row['interval'])} (k {row['pareto_k']:.2f})"
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)

@@ -11,10 +11,9 @@ import numpy as np
 from fitting.inference.sample import blocks, inference_data
 from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
-from fitting.report.formatting import Table
+from fitting.report.formatting import Table, listed
 from fitting.runtime import activity, files
 from fitting.studies.fit import run_folder
-from fitting.studies.fit.sentences import listed
 from fitting.studies.output import output_folder, publish
 
 TABLE, NUMBERS = "runs.md", "runs.json"
