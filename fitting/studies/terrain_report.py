@@ -245,14 +245,7 @@ def _rounded(value: float) -> float | None:
 
 @styled
 def plan(terrain: Reconstruction, margin: float, legs: tuple[str, ...], title: str) -> Figure:
-    """The chosen surface from above with its stances, and how well each kind predicts them.
-
-    Args:
-        terrain: what was reconstructed.
-        margin: shown around the stances, m.
-        legs: their names.
-        title: of the figure.
-    """
+    """The chosen surface from above with its stances, and how well each kind predicts them."""
     figure = Figure(figsize=(17, 9.5), layout="constrained")
     figure.suptitle(title)
     ((left, right),) = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])

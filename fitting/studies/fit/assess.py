@@ -31,13 +31,7 @@ def search(
     experiment: Experiment,
     first: Float[np.ndarray, " free"] | None = None,
 ) -> Solution:
-    """The best fit, without any estimate of how certain it is.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of the search.
-        first: the u from which the first descent begins; None is the experiment's.
-    """
+    """The best fit from `first`, in u, or the experiment's start; not how certain it is."""
     return find_best_fit(
         problem.with_weight(1.0),
         experiment.fit.search,
@@ -54,10 +48,6 @@ def search_with_noise(
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
     Unless the experiment asks for noise that moves the best point, it only gets a weight.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of noise and search.
     """
     solution = search(problem, experiment)
     settings, noise = experiment.fit.search, experiment.noise
@@ -153,12 +143,6 @@ def _search_lower(
     """The best fit from a point that is lower than a solution; steps and time add to its own.
 
     Where it is lower than the starts' agreement allows, the search begins anew there.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of the search.
-        before: the solution that is left.
-        lower_u: the lower point, in u.
     """
     settings = experiment.fit.search
     after = refine(problem.with_weight(1.0), before, lower_u, settings)

@@ -225,12 +225,7 @@ class CaptureSigns(NamedTuple):
 
 
 def find(clips: Sequence[ClipData], playbacks: Sequence[Playback]) -> list[CaptureSigns]:
-    """The signs of each clip.
-
-    Args:
-        clips: with whole skeletons; without them nothing is looked for.
-        playbacks: of the same clips, with the fitted system.
-    """
+    """The signs of each clip, with whole skeletons; without these nothing is looked for."""
     return [
         CaptureSigns(_of_ground(clip), measure_lag(play))
         for clip, play in zip(clips, playbacks, strict=False)
@@ -245,11 +240,7 @@ def _of_ground(clip: ClipData) -> GroundOffset:
 
 
 def measure_lag(clip: Playback) -> float:
-    """How long after the fitted motion the capture shows the same, s; 0 unless that is clear.
-
-    Args:
-        clip: with the fitted system.
-    """
+    """How long after the fitted motion the capture shows the same, s; 0 unless that is clear."""
     dt, frames = float(clip.dt[-1]), len(clip.dt)
     reach = min(round(LONGEST / dt), (frames - FEWEST_FRAMES) // 2)
     if reach < 1:

@@ -52,24 +52,13 @@ class ClipMotions:
 
 @in_float64
 def fitted_clip(data: ClipData, result: jaxik.Result) -> Clip:
-    """A clip as a system leaves it.
-
-    Args:
-        data: the clip, over the frames of the result.
-        result: of the system on this clip.
-    """
+    """A clip as a system leaves it."""
     return clip_from_result(data.base, result, rise=data.root.rise)
 
 
 @in_float64
 def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> ClipMotions:
-    """The motions of one clip, measured on its ground.
-
-    Args:
-        data: the clip.
-        before: what the system made of it before the fit.
-        fitted: what the fitted system makes of it.
-    """
+    """The motions of one clip, measured on its ground."""
     animated = raised(data.base, data.root.rise)
     captured = with_soles_of(data.reference, data.base)
     solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}

@@ -383,15 +383,7 @@ def profiles(
     truth: Mapping[str, float] | None,
     title: str,
 ) -> Figure:
-    """Each parameter's profile: on the left over its whole range, on the right its interval.
-
-    Args:
-        parameters: by name.
-        curves: their profiles, by name.
-        units: of the parameters, by name.
-        truth: known values by name.
-        title: of the figure.
-    """
+    """Each parameter's profile: on the left over its whole range, on the right its interval."""
     lines = -(-len(curves) // PER_ROW)
     figure = Figure(figsize=(17, 2.35 * lines + 1.6), layout="constrained")
     figure.suptitle(title)

@@ -91,11 +91,7 @@ def activity_table(clips: Sequence[ClipActivity]) -> Table:
 
 
 def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
-    """Thresholds: decisions that flip, and the rise in cost, when one moves by 10 % of its range.
-
-    Args:
-        nudges: `playback.nudge_thresholds`.
-    """
+    """Decisions that flip, and the rise in cost, when a threshold moves by 10 % of its range."""
     table = [["threshold", "flips, moved down", "cost", "flips, moved up", "cost"]]
     for name, both in nudges.items():
         cells = [name]
@@ -111,14 +107,7 @@ def parameter_rows(
     docs: Mapping[str, str],
     truth: Truth,
 ) -> list[ParameterRow]:
-    """The free parameters.
-
-    Args:
-        rows: their numbers.
-        scales: by name, on which the range is drawn; all but `log` are linear.
-        docs: by name, what they mean.
-        truth: known values, by name.
-    """
+    """The free parameters."""
     return [_parameter_row(row, scales[row["name"]], docs[row["name"]], truth) for row in rows]
 
 

@@ -30,12 +30,7 @@ DIRECTIONS = (  # of an offset up, forward and left: positive, negative
 
 
 def determined_blocks(fitted: Fit, clips: int) -> list[Block]:
-    """How well the clips determine the parameters, and by what.
-
-    Args:
-        fitted: the fit.
-        clips: how many there are.
-    """
+    """How well the clips determine the parameters, and by what."""
     known, rows = fitted.identifiability, fitted.summary["parameters"]
     names = ", ".join(f"`{name}`" for name in known.undetermined)
     blocks: list[Block] = [
@@ -161,13 +156,7 @@ def evidence_table(evidence: Mapping[str, Sequence[Evidence]], clips: int) -> Ta
 
 
 def describe(playback: Playback, window: WorstWindow, legs: Sequence[str]) -> list[str]:
-    """What went wrong in the worst window, a sentence or two in each line.
-
-    Args:
-        playback: of the fitted system.
-        window: its worst one.
-        legs: their names.
-    """
+    """What went wrong in the worst window, a sentence or two in each line."""
     start, end = playback.time[window.start], playback.time[window.end]
     fractions = [f"{_name(kind)} {percent(part, 0)}" for kind, part in window.fractions.items()]
     others = "; " + ", ".join(fractions[1:]) if fractions[1:] else ""

@@ -39,9 +39,6 @@ class RecordPrice:
 def measure(fitted: Fit) -> RecordPrice | None:
     """Fits what the experiment would have free without the restriction, from where its fit ended.
 
-    Args:
-        fitted: the fit of a restricted experiment.
-
     Returns:
         None if the restriction left nothing out, or if Ctrl-C ended either search.
     """

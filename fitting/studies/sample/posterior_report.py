@@ -58,10 +58,6 @@ def write_posterior(run: Path, sampled: SampledFit) -> str:
 
     Where the fit has left no report, there is one of the posterior only.
 
-    Args:
-        run: the folder of the run.
-        sampled: the posterior and the fit.
-
     Raises:
         ValueError: the report of the fit is damaged.
     """
@@ -238,12 +234,7 @@ def _draw(axes: Axes, band: Band, *, clip: bool) -> None:
 
 
 def contradiction_sentences(sampled: SampledFit, run: Path | None) -> list[str]:
-    """What contradicts the fit, a sentence each, with how to go on; none if nothing does.
-
-    Args:
-        sampled: the posterior and the fit.
-        run: the folder of the run, if there is one.
-    """
+    """What contradicts the fit, a sentence each, with how to go on; none if nothing does."""
     return [*_lower_point(sampled, run), *map(_describe, sampled.disagreements)]
 
 

@@ -50,13 +50,7 @@ class Replay:
 
 @in_float64
 def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> Replay:
-    """Runs draws of a posterior through the clips.
-
-    Args:
-        problem: that was sampled.
-        posterior: with sigmas, if the problem leaves them open.
-        seed: of the replicates' noise.
-    """
+    """Runs draws of a posterior through the clips."""
     every = math.ceil(len(noise.thinned(posterior.kept_u)) / DRAWS)
     u = noise.thinned(posterior.kept_u)[::every]
     sigmas = {kind: draws[::every] for kind, draws in posterior.sigmas.items()}
@@ -102,13 +96,7 @@ class _Clip:
         self._last: Playback | None = None
 
     def add(self, played: Playback, sigmas: Mapping[str, float], replicated: bool) -> None:
-        """Takes in what the system of one draw makes of the clip, and replicates its motion.
-
-        Args:
-            played: the clip with the system.
-            sigmas: of this draw, by kind; others are the scene's.
-            replicated: whether to make one.
-        """
+        """Takes in what the system of one draw makes of the clip, and replicates its motion."""
         given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
         ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
         frames = of_frames(played, self._scene, self._density, ratios)
