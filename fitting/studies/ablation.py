@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple, NotRequired, TypedDict
 
 import jax
 import numpy as np
@@ -54,12 +54,13 @@ from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
-from fitting.runtime.validation import error_context
+from fitting.runtime.validation import Content, error_context
 from jaxik.world.similarity import similar
 
 from .animations import Animation
 from .campaign import Campaign
 from .fit.assess import search_with_noise
+from .fit.fit import SearchRecord, record_search
 from .output import output_folder, publish
 
 NUMBERS = "contribution.json"
@@ -85,11 +86,23 @@ class Row:
     agreement: Accuracy
     values: Mapping[str, float]
     """Fitted, by name."""
-    converged: bool
-    message: str
-    """Of the fit."""
-    seconds: float
-    """Duration of the fit."""
+    search: SearchRecord | None
+    """None where nothing was free."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether its search has, if there was one."""
+        return self.search is None or self.search["converged"]
+
+    @property
+    def message(self) -> str:
+        """Of the search."""
+        return "Nothing is free." if self.search is None else self.search["message"]
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the search."""
+        return 0.0 if self.search is None else self.search["seconds"]
 
 
 class StoredRow(TypedDict):
@@ -97,6 +110,8 @@ class StoredRow(TypedDict):
 
     agreement: dict[str, Finite | None]
     """None for NaN, which JSON does not have."""
+    search: NotRequired[Content | None]
+    """Rows of earlier versions lack it."""
 
 
 class Rows(TypedDict):
@@ -257,7 +272,7 @@ def _hide(data: ClipData, frames: slice) -> ClipData:
 def _fit(task: Task) -> Row:
     """The row of a task."""
     _, _, variant, _, data = task
-    values, converged, message, seconds = {}, True, "Nothing is free.", 0.0
+    values, record = {}, None
     first = data.measured[0][0].base.rig
     ik = variant.starting_system(first)
     if variant.free:
@@ -270,7 +285,7 @@ def _fit(task: Task) -> Row:
             raise KeyboardInterrupt
         ik = problem.space.unpack(solution.u)
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
-        converged, message, seconds = solution.converged, solution.message, solution.seconds
+        record = record_search(variant, problem, solution)
     with activity.announced("Measuring how far it is from the capture"):
         accuracy = summarise(
             [
@@ -278,7 +293,7 @@ def _fit(task: Task) -> Row:
                 for clip, frames in data.measured
             ]
         )
-    return Row(task.key, task.name, task.part, accuracy, values, converged, message, seconds)
+    return Row(task.key, task.name, task.part, accuracy, values, record)
 
 
 def _for_body(ik: jaxik.FootIK, size: float | None) -> jaxik.FootIK:
@@ -337,7 +352,7 @@ def read(folder: Path | None) -> list[Row]:
 
 
 def _rows(stored: Rows) -> list[Row]:
-    return [_row(fields) for fields in stored["rows"]]
+    return [_row(fields) for fields in stored["rows"] if "search" in fields]
 
 
 def _row(stored: StoredRow) -> Row:

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
@@ -115,7 +115,7 @@ def load_found(path: Path) -> None:
 def rows_text() -> bytes:
     names = [field.name for field in dataclasses.fields(Accuracy)]
     accuracy = Accuracy(**{name: 0.01 * place for place, name in enumerate(names)})
-    row = Row("0123abcd", "locks", 1, accuracy, {"lean.gain": 0.2}, True, "Converged.", 1.5)
+    row = Row("0123abcd", "locks", 1, accuracy, {"lean.gain": 0.2}, cast(Any, SEARCH))
     return text_of({"rows": [dataclasses.asdict(row)]})
 
 

@@ -24,6 +24,7 @@ from fitting.report import pages
 from fitting.runtime import activity
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
+from fitting.studies.fit.fit import SearchRecord
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
@@ -233,10 +234,18 @@ def test_a_changed_clip_is_fitted_again(tmp_path, search):
 # The report
 
 
+SEARCH: SearchRecord = {
+    "converged": True, "message": "Far off.", "cost_before": 9.0, "cost": 1.0, "steps": 1,
+    "starts": 1, "agreeing": 1, "seconds": 1.5,
+}  # fmt: skip
+
+
 def row(variant: str, part: int, **figures: float) -> Row:
     all_figures = dict.fromkeys(ACCURACY, 0.02) | figures
     values = {"pelvis.on_gain": 0.3} | ({} if variant == PITCH else {"foot.max_pitch": 0.4})
-    return Row("key", variant, part, Accuracy(**all_figures), values, part != 2, "Far off.", 1.5)
+    return Row(
+        "key", variant, part, Accuracy(**all_figures), values, {**SEARCH, "converged": part != 2}
+    )
 
 
 ROWS = [
