@@ -345,7 +345,15 @@ def draft(
         experiment=replace(experiment, free=free),
         grounds=grounds,
         assumptions=tuple(
-            _assumptions(request, clip, ground) for clip, ground in zip(data, grounds, strict=True)
+            tuple(
+                of_clip(
+                    clip,
+                    None if ground is None else ground.terrain,
+                    base_is_own=bool(request.bases),
+                    sole_is_given=request.reading.sole is not None,
+                )
+            )
+            for clip, ground in zip(data, grounds, strict=True)
         ),
         forecasts=tuple(forecasts),
         check=check,
@@ -363,14 +371,6 @@ def _decisive(ik: jaxik.FootIK, problem: Problem[jaxik.FootIK], candidates: Free
 
     with activity.announced("Looking for what leaves the feet alone"):
         return leave_alone(ik, candidates, problem.data, is_harmless)
-
-
-def _assumptions(
-    request: DraftRequest, data: ClipData, ground: Ground | None
-) -> tuple[Assumption, ...]:
-    terrain = None if ground is None else ground.terrain
-    is_given = request.reading.sole is not None
-    return tuple(of_clip(data, terrain, base_is_own=bool(request.bases), sole_is_given=is_given))
 
 
 def _entry(request: DraftRequest, clip: Clip, index: int, ground: Ground | None) -> ClipEntry:

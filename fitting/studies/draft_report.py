@@ -23,7 +23,6 @@ from .draft import (
     EXPERIMENT,
     Draft,
     DraftRequest,
-    Ground,
     check_request,
     draft,
     reconstruct_grounds,
@@ -40,11 +39,6 @@ OPENING = """\
 # Runs as it is: jaxik fit {name} -o RUN
 # What is commented out is not set; it then has the value that the comment shows."""
 TOP = ("name", "preset", "faithful", "record_only", "body", "fps")  # that a draft always sets
-
-
-def write_ground(ground: Ground) -> None:
-    """Writes ground that was reconstructed, with its numbers and a picture."""
-    terrain_report.write(ground.mesh, ground.terrain, ground.clip, MARGIN)
 
 
 def document(draft: Draft) -> Document:
@@ -239,7 +233,7 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
             with activity.announced("Writing and drawing the ground"):
                 for ground in grounds:
                     if ground is not None:
-                        write_ground(ground)
+                        terrain_report.write(ground.mesh, ground.terrain, ground.clip, MARGIN)
             drafted = draft(request, clips, folder, grounds)
         except BaseException:  # also Ctrl-C: ground without an experiment is of no use
             for mesh in meshes:
@@ -247,6 +241,6 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
             raise
         path = drafted.experiment.path
         files.write_text(path, as_toml(drafted))
-        activity.log(joined(["", text(document(drafted))]))
+        activity.log(joined(["", text(document(drafted)), ""]))
         activity.log(f"written to {path}; now: jaxik fit {path} -o RUN")
         return drafted.experiment

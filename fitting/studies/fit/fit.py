@@ -1,7 +1,7 @@
 """One fit: the search, what it found, and its numbers as `fit.json` holds them."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NotRequired, TypeAlias, TypedDict
@@ -111,15 +111,6 @@ def summarise_distances(distances: Distances) -> DistancesSummary:
     }
     setbacks = [describe_setback(setback) for setback in distances.setbacks]
     return {**parts, "setbacks": setbacks, "kept": distances.better}  # type: ignore[typeddict-item]
-
-
-def summarise(verdict: Verdict, groups: Sequence[Group]) -> GoodnessSummary:
-    """The verdict, and the numbers of all groups."""
-    return {
-        "fits": verdict.fits,
-        "sentence": verdict.sentence,
-        "groups": [_summarise_group(group) for group in groups],
-    }
 
 
 def _summarise_group(group: Group) -> GroupSummary:
@@ -384,15 +375,6 @@ class Fit(Shown):
         """Whether it is visibly further from a capture than what there was before it."""
         return self.has_noise and bool(self.distances.setbacks)
 
-    @property
-    def clips_as_fitted(self) -> tuple[ClipData, ...]:
-        """The clips, on their ground as the fitted capture takes it."""
-        pairs = zip(self.clips, self.scenes, strict=False)
-        return tuple(
-            clip if scene.capture is None else clip._replace(terrain=scene.terrain)
-            for clip, scene in pairs
-        )
-
     @cached_property
     def capture_signs(self) -> list[CaptureSigns]:
         """What each clip shows of a capture that is not as it seems."""
@@ -431,7 +413,11 @@ class Fit(Shown):
         return {
             "experiment": self.experiment.name,
             **self.search,
-            "goodness": summarise(self.verdict, self.groups),
+            "goodness": {
+                "fits": self.verdict.fits,
+                "sentence": self.verdict.sentence,
+                "groups": list(map(_summarise_group, self.groups)),
+            },
             "distances": summarise_distances(self.distances),
             "parameters": self.parameters,
             "correlated": [list(pair) for pair in self.identifiability.correlated],

@@ -47,7 +47,7 @@ from . import (
     identifiability_report,
 )
 from .assess import MIN_IMPROVEMENT
-from .fit import Fit, FittedParameter
+from .fit import Fit
 from .fit_motions import ClipMotions, Rehearsal
 from .run_folder import FIT, PARAMETERS, SUMMARY
 
@@ -250,15 +250,13 @@ def _draw_search(run: Path, fitted: Fit) -> list[Plot]:
     return [_save(run, "profiles.png", title, figure), plot]
 
 
-def _ranges(fitted: Fit, parameters: Sequence[FittedParameter], label: str) -> Ranges:
+def _ranges(fitted: Fit, of: str, label: str) -> Ranges:
+    """The parameters of the system, or of the capture."""
     space, truth = fitted.problem.space, fitted.known_values
+    free = {parameter.name: parameter for parameter in space.parameters}
     docs = parameter_tree.docs(space.system)
-    rows = fit_tables.parameter_rows(
-        parameters,
-        {parameter.name: parameter.scale for parameter in space.parameters},
-        {parameter.name: docs.get(parameter.leaf, "") for parameter in space.parameters},
-        truth,
-    )
+    parameters = [row for row in fitted.summary["parameters"] if row.get("of", "system") == of]
+    rows = [fit_tables.parameter_row(row, free[row["name"]], docs, truth) for row in parameters]
     return Ranges(rows, label, RANGES, fit_tables.parameter_table(parameters, truth))
 
 
@@ -268,7 +266,7 @@ def _parameters(fitted: Fit) -> Section:
     return Section(
         "Parameters",
         [
-            _ranges(fitted, goodness_report.of_system(rows), "Free parameters"),
+            _ranges(fitted, "system", "Free parameters"),
             Grid(fit_tables.gain_table(rows), "Gains and their half-lives"),
             Text(known, brief=True),
         ],
@@ -276,13 +274,13 @@ def _parameters(fitted: Fit) -> Section:
 
 
 def _capture(fitted: Fit) -> Section:
-    rows = goodness_report.of_capture(fitted.summary["parameters"])
+    ranges = _ranges(fitted, "capture", "Of the captures")
     words = "What is not known of the captures, fitted along; no part of the system:"
     return Section(
         "The capture",
         [
-            Text(words if rows else "", brief=True),
-            _ranges(fitted, rows, "Of the captures"),
+            Text(words if ranges.rows else "", brief=True),
+            ranges,
             Points(goodness_report.sentences(fitted), brief=True),
         ],
     )
@@ -466,7 +464,11 @@ def _feet(motions: Sequence[ClipMotions]) -> str:
         for name in ("before", "fitted", "captured")
     )
     shares = [
-        max((m.penetration_stance for m in each), key=_known) for each in (before, after, captured)
+        max(
+            (measures.penetration_stance for measures in each),
+            key=lambda share: -1.0 if math.isnan(share) else share,
+        )
+        for each in (before, after, captured)
     ]
     if math.isnan(shares[1]):
         return "No standing foot has ground under it, so nothing can be said of feet in the ground."
@@ -479,10 +481,6 @@ def _feet(motions: Sequence[ClipMotions]) -> str:
     if not math.isnan(shares[2]):
         text += f" and {percent(shares[2])} as captured"
     return f"{text}."
-
-
-def _known(share: float) -> float:
-    return -1.0 if math.isnan(share) else share
 
 
 def _centimetres(length: float) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from fitting.motion.playback import ClipActivity, Nudge
+from fitting.problem.space import FreeParameter
 from fitting.report.document import ParameterRow
 from fitting.report.formatting import Table, interval, number, percent
 
@@ -101,22 +102,15 @@ def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
     return table
 
 
-def parameter_rows(
-    rows: Sequence[FittedParameter],
-    scales: Mapping[str, str],
-    docs: Mapping[str, str],
-    truth: Truth,
-) -> list[ParameterRow]:
-    """The free parameters."""
-    return [_parameter_row(row, scales[row["name"]], docs[row["name"]], truth) for row in rows]
-
-
-def _parameter_row(row: FittedParameter, scale: str, doc: str, truth: Truth) -> ParameterRow:
+def parameter_row(
+    row: FittedParameter, free: FreeParameter, docs: Mapping[str, str], truth: Truth
+) -> ParameterRow:
+    """A parameter within its range, which is linear unless its scale is `log`; docs by leaf."""
     low, high = row["low"], row["high"]
 
     def fraction(value: float) -> float:
         value = min(max(value, low), high)
-        if scale == "log" and low > 0:
+        if free.scale == "log" and low > 0:
             return math.log(value / low) / math.log(high / low)
         return (value - low) / (high - low)
 
@@ -127,7 +121,7 @@ def _parameter_row(row: FittedParameter, scale: str, doc: str, truth: Truth) -> 
         words += f", at its {'lower' if row['at_bound'] == 'low' else 'upper'} bound"
     return ParameterRow(
         name=row["name"],
-        meaning=doc,
+        meaning=docs.get(free.leaf, ""),
         value=number(row["value"]),
         unit=unit,
         interval=interval(*row["interval"]),

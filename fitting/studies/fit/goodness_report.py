@@ -23,7 +23,7 @@ from fitting.report.document import Block, Grid, Heading, Text
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 
 from .capture_check import CaptureSigns
-from .fit import Fit, FittedParameter
+from .fit import Fit
 
 NOISE = (
     "Noise and found correlation are those of the errors themselves; left is the correlation from "
@@ -47,17 +47,13 @@ COUNTED = (
 
 def goodness_blocks(fitted: Fit) -> list[Block]:
     """The sizes of the residuals, and whether they look like noise."""
-    sizes = Grid(_size_table(fitted), "Sizes of the residuals")
+    judged = not (fitted.assumed.sigmas_estimated or fitted.assumed.counted)
+    sizes = Grid(size_table(fitted.groups, judged=judged), "Sizes of the residuals")
     if not fitted.has_noise:
         tolerances = Grid(tolerance_table(fitted.groups), "Errors and tolerances", brief=False)
         return [sizes, Text(TOLERANCES), tolerances]
     noise = Grid(noise_table(fitted.groups), "Residuals as noise", brief=False)
     return [Text(_describe_sizes(fitted)), sizes, *noise_blocks(fitted), Text(NOISE), noise]
-
-
-def _size_table(fitted: Fit) -> Table:
-    judged = not (fitted.assumed.sigmas_estimated or fitted.assumed.counted)
-    return size_table(fitted.groups, judged=judged)
 
 
 def _describe_sizes(fitted: Fit) -> str:
@@ -215,16 +211,6 @@ def _estimated_correlations(fitted: Fit) -> Table:
         ends = interval(rho - half, min(rho + half, 1.0))
         table.append([RESIDUALS[kind].name, f"{rho:.3f}", ends])
     return table
-
-
-def of_system(rows: Sequence[FittedParameter]) -> list[FittedParameter]:
-    """The rows of parameters of the system."""
-    return [row for row in rows if row.get("of") != "capture"]
-
-
-def of_capture(rows: Sequence[FittedParameter]) -> list[FittedParameter]:
-    """The rows of what is not known of captures."""
-    return [row for row in rows if row.get("of") == "capture"]
 
 
 def sentences(fitted: Fit) -> list[str]:

@@ -19,6 +19,12 @@ from fitting.studies.output import output_folder, publish
 TABLE, NUMBERS = "runs.md", "runs.json"
 
 CLEAR = 2.0  # standard errors, from which a difference says something
+COLUMNS = (
+    "elpd is the expected log predictive density of the captured motion: blocks of "
+    f"{SECONDS:g} s, each predicted from the others by Pareto-smoothed importance sampling. "
+    "Larger is better. A difference of less than twice its standard error (±) says little, and "
+    "unreliable blocks make it worse. Parameters is their effective number."
+)
 LIMITS = [
     "The order is that of these runs on this motion: the best of them may still not fit it, which "
     "the page of its run says.",
@@ -126,16 +132,6 @@ def table(runs: Sequence[ComparedRun]) -> Table:
     return rows
 
 
-def explanation() -> str:
-    """What the columns mean."""
-    return (
-        "elpd is the expected log predictive density of the captured motion: blocks of "
-        f"{SECONDS:g} s, each predicted from the others by Pareto-smoothed importance sampling. "
-        "Larger is better. A difference of less than twice its standard error (±) says little, and "
-        "unreliable blocks make it worse. Parameters is their effective number."
-    )
-
-
 def document(runs: Sequence[ComparedRun]) -> Document:
     """What a comparison of runs says, the best run first."""
     tied = undecided(runs)
@@ -149,7 +145,7 @@ def document(runs: Sequence[ComparedRun]) -> Document:
         sections=[
             Section(
                 "What the runs predict",
-                [Grid(table(runs), "Runs"), Text(explanation(), brief=True)],
+                [Grid(table(runs), "Runs"), Text(COLUMNS, brief=True)],
             ),
             Section("Limits of the data", [Points(LIMITS)]),
         ],
