@@ -58,11 +58,7 @@ class Assumption(NamedTuple):
 
 
 def of_clip(
-    data: ClipData,
-    ground: Reconstruction | None,
-    *,
-    base_is_own: bool,
-    sole_is_given: bool = False,
+    data: ClipData, ground: Reconstruction | None, *, base_is_own: bool, sole_is_given: bool = False
 ) -> list[Assumption]:
     """The assumptions about one clip of an experiment.
 
@@ -278,10 +274,7 @@ def reconstruct_grounds(
 
 @in_float64
 def draft(
-    request: DraftRequest,
-    clips: Sequence[Clip],
-    folder: Path,
-    grounds: tuple[Ground | None, ...],
+    request: DraftRequest, clips: Sequence[Clip], folder: Path, grounds: tuple[Ground | None, ...]
 ) -> Draft:
     """Chooses what to fit, and says what is assumed.
 

@@ -19,14 +19,7 @@ from fitting.runtime.validation import Content
 from jaxik.world.body import scaled_declarations
 
 from . import terrain_report
-from .draft import (
-    EXPERIMENT,
-    Draft,
-    DraftRequest,
-    check_request,
-    draft,
-    reconstruct_grounds,
-)
+from .draft import EXPERIMENT, Draft, DraftRequest, check_request, draft, reconstruct_grounds
 from .fit import goodness_report
 from .output import output_folder
 

@@ -39,13 +39,7 @@ from fitting.runtime.beside import calls_beside
 from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 
-from . import (
-    fit_motions,
-    fit_plots,
-    fit_tables,
-    goodness_report,
-    identifiability_report,
-)
+from . import fit_motions, fit_plots, fit_tables, goodness_report, identifiability_report
 from .assess import MIN_IMPROVEMENT
 from .fit import Fit
 from .fit_motions import ClipMotions, Rehearsal
@@ -355,7 +349,7 @@ def _limits(fitted: Fit, activities: Sequence[ClipActivity]) -> Section:
     blocks: list[Block] = []
     if missing:
         blocks.append(Text("What a clip would have to show to determine the rest:"))
-        blocks.append(Terms([[f"`{name}`", words] for name, words in missing]))
+        blocks.append(Terms(missing))
     elif fitted.summary["parameters"]:
         blocks.append(Text("These clips determine every free parameter."))
     return Section("Limits of the data", [*blocks, Points(_remarks(fitted))])
@@ -371,24 +365,15 @@ def _asked(fitted: Fit) -> Table:
     """What the experiment asks for."""
     experiment = fitted.experiment
     sigmas = fitted.playbacks[0].sigmas
-    rows = [
-        ["System", pages.system(experiment)],
-        ["Free parameters", f"{len(experiment.free)}"],
-    ]
+    rows = [["System", pages.system(experiment)], ["Free parameters", f"{len(experiment.free)}"]]
     if experiment.capture:
         rows.append(["Of the captures", f"{experiment.free_count - len(experiment.free)}"])
     for number, (clip, entry) in enumerate(zip(fitted.clips, experiment.clips, strict=False), 1):
-        frames = clip.reference.frame_count
-        rows.append(
-            [
-                f"Clip {number}" if len(fitted.clips) > 1 else "Clip",
-                f"{entry.reference.name}: {frames} frames at {clip.reference.fps:g} Hz, "
-                f"{clip.reference.seconds:.1f} s, on {entry.terrain.name}",
-            ]
-        )
+        motion, name = clip.reference, f"Clip {number}" if len(fitted.clips) > 1 else "Clip"
+        text = f"{entry.reference.name}: {motion.frame_count} frames at {motion.fps:g} Hz"
+        rows.append([name, f"{text}, {motion.seconds:.1f} s, on {entry.terrain.name}"])
     kinds = [f"{kind} {float(sigmas[kind]):.3g}" for kind in fitted.playbacks[0].fitted_kinds]
-    rows.append(["Noise, m and rad", ", ".join(kinds)])
-    return [*rows, pages.loss_and_seed(experiment)]
+    return [*rows, ["Noise, m and rad", ", ".join(kinds)], pages.loss_and_seed(experiment)]
 
 
 def _remarks(fitted: Fit) -> list[str]:

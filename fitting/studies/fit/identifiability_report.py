@@ -135,7 +135,7 @@ def missing_motion(fitted: Fit, clips: Sequence[ClipActivity]) -> list[list[str]
                 known.profiles[parameter.name],
                 float(np.mean(active)) if active else None,
             )
-            missing.append([parameter.name, words])
+            missing.append([f"`{parameter.name}`", words])
     return missing
 
 

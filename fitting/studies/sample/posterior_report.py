@@ -45,6 +45,10 @@ TEXT = "posterior.md"
 MAX_CLIPS = 4  # that are drawn
 
 SHOWN = 5  # blocks in the table
+SENSITIVE = (
+    "Sensitive to their prior, for an end of the interval moves by more than a quarter of its width"
+)
+UNKNOWN = "The draws cannot tell how sensitive these are; sample with another `[prior]` to see"
 CORRELATED = 0.3  # between neighbouring blocks, from which the standard error is too small
 
 
@@ -91,12 +95,10 @@ def sections(sampled: SampledFit, run: Path | None) -> list[Section]:
     labels = [f"{name}, {units[name]}" if units[name] != "1" else name for name in posterior.names]
     values = {name: row["value"] for name, row in rows.items()}
     replay, left_out = sampled.replay, sampled.left_out
-    corner, walkers = (
-        f"{experiment.name}: posterior of the parameters",
-        f"{experiment.name}: walkers",
-    )
+    corner = f"{experiment.name}: posterior of the parameters"
+    walkers = f"{experiment.name}: walkers"
     blocks: list[Block] = [
-        *(Text(f"**{line}**", brief=True) for line in contradiction_sentences(sampled, run)),
+        *(Text(f"**{line}**", brief=True) for line in _contradictions(sampled, run)),
         Points(_health(posterior), brief=True),
         Grid(posterior_table(posterior, truth, units), "Posterior of the parameters"),
     ]
@@ -233,23 +235,17 @@ def _draw(axes: Axes, band: Band, *, clip: bool) -> None:
     )
 
 
-def contradiction_sentences(sampled: SampledFit, run: Path | None) -> list[str]:
+def _contradictions(sampled: SampledFit, run: Path | None) -> Iterator[str]:
     """What contradicts the fit, a sentence each, with how to go on; none if nothing does."""
-    return [*_lower_point(sampled, run), *map(_describe, sampled.disagreements)]
-
-
-def _lower_point(sampled: SampledFit, run: Path | None) -> Iterator[str]:
-    if not sampled.has_lower_point:
-        return
-    gain = sampled.posterior.improvement
-    if run is None:
+    if sampled.has_lower_point:
         go_on = "fit again with `[start]` at `Posterior.best_values`"
-    else:
-        go_on = f"go on from there with `jaxik fit {run / LOWER_POINT} -o {run}-lower`"
-    yield (
-        f"The chain contradicts its fit: it met a point whose log-probability is {gain:.3g} higher."
-        f" The fit is not the best one; {go_on}."
-    )
+        if run is not None:
+            go_on = f"go on from there with `jaxik fit {run / LOWER_POINT} -o {run}-lower`"
+        yield (
+            "The chain contradicts its fit: it met a point whose log-probability is "
+            f"{sampled.posterior.improvement:.3g} higher. The fit is not the best one; {go_on}."
+        )
+    yield from map(_describe, sampled.disagreements)
 
 
 def _describe(found: Disagreement) -> str:
@@ -313,15 +309,8 @@ def island_table(islands: tuple[Island, ...]) -> Table:
     """Weight, exchanges and height of each island."""
     table = [["island", "weight", "exchanges", "walkers at the end", "highest log-probability"]]
     for index, island in enumerate(islands, 1):
-        table.append(
-            [
-                str(index),
-                _weight(island),
-                str(island.exchanges),
-                str(island.walkers),
-                number(island.log_probability),
-            ]
-        )
+        counts = map(str, (island.exchanges, island.walkers))
+        table.append([str(index), _weight(island), *counts, number(island.log_probability)])
     return table
 
 
@@ -386,15 +375,9 @@ def worst_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> Table:
     seconds = np.maximum(blocks.end - blocks.start, 1e-9)
     for i in np.argsort(found.elpd_of_block / seconds)[:SHOWN]:
         mark = "" if found.pareto_k[i] <= found.max_k else "!"
-        table.append(
-            [
-                str(blocks.clip[i]),
-                f"{blocks.start[i]:.1f} s",
-                f"{blocks.end[i]:.1f} s",
-                f"{found.elpd_of_block[i] / seconds[i]:.1f}",
-                f"{found.pareto_k[i]:.2f}{mark}",
-            ]
-        )
+        cells = [str(blocks.clip[i]), f"{blocks.start[i]:.1f} s", f"{blocks.end[i]:.1f} s"]
+        cells += [f"{found.elpd_of_block[i] / seconds[i]:.1f}", f"{found.pareto_k[i]:.2f}{mark}"]
+        table.append(cells)
     return table
 
 
@@ -458,17 +441,11 @@ def posterior_prior_blocks(sampled: SampledFit, units: Mapping[str, str]) -> lis
         if name not in moved and any(row["sensitive"] is None for row in rows)
     ]
     table = prior_and_posterior_table(sampled, units)
-    sentences = []
-    if moved:
-        sentences.append(
-            f"Sensitive to their prior, for an end of the interval moves by more than a quarter of "
-            f"its width: {_names(moved)}."
-        )
-    if unknown:
-        sentences.append(
-            f"The draws cannot tell how sensitive these are; sample with another `[prior]` to see: "
-            f"{_names(unknown)}."
-        )
+    sentences = [
+        f"{words}: {', '.join(f'`{name}`' for name in names)}."
+        for words, names in ((SENSITIVE, moved), (UNKNOWN, unknown))
+        if names
+    ]
     return [
         Heading("Prior and posterior"),
         Text(
@@ -498,7 +475,3 @@ def _reweighted(row: Reweighted) -> str:
     if row["median"] is None or row["interval"] is None:
         return f"unreliable (k {row['pareto_k']:.2f})"
     return f"{number(row['median'])}, {interval(*row['interval'])} (k {row['pareto_k']:.2f})"
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(f"`{name}`" for name in names)

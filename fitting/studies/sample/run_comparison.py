@@ -144,8 +144,7 @@ def document(runs: Sequence[ComparedRun]) -> Document:
         findings=findings(runs),
         sections=[
             Section(
-                "What the runs predict",
-                [Grid(table(runs), "Runs"), Text(COLUMNS, brief=True)],
+                "What the runs predict", [Grid(table(runs), "Runs"), Text(COLUMNS, brief=True)]
             ),
             Section("Limits of the data", [Points(LIMITS)]),
         ],
@@ -162,25 +161,21 @@ def undecided(runs: Sequence[ComparedRun]) -> list[ComparedRun]:
 def findings(runs: Sequence[ComparedRun]) -> list[Finding]:
     """Whether the figures are reliable, who is best and by how much, and who is last."""
     best, second, last = runs[0], runs[1], runs[-1]
-    shaky = [f"`{run.name}` ({run.unreliable})" for run in runs if run.unreliable]
-    if shaky:
+    reliable = Finding("All blocks are predicted reliably from the others.")
+    if shaky := [f"`{run.name}` ({run.unreliable})" for run in runs if run.unreliable]:
         reliable = Finding(
             f"The figures are not fully reliable: there are blocks that the others do not predict "
             f"reliably, of {listed(shaky)}.",
             bad=True,
         )
-    else:
-        reliable = Finding("All blocks are predicted reliably from the others.")
     behind = f"{second.behind:.1f} ± {second.behind_error:.1f}"
-    tied = [f"`{run.name}`" for run in undecided(runs)]
-    if tied:
+    order = Finding(f"`{best.name}` predicts best; `{second.name}` is {behind} below.")
+    if tied := [f"`{run.name}`" for run in undecided(runs)]:
         order = Finding(
             f"The motion does not tell `{best.name}`, which predicts best, from {listed(tied)}: "
             f"`{second.name}` is {behind} below, less than {CLEAR:g} standard errors.",
             bad=True,
         )
-    else:
-        order = Finding(f"`{best.name}` predicts best; `{second.name}` is {behind} below.")
     furthest = (
         f"`{last.name}` predicts worst, {last.behind:.1f} ± {last.behind_error:.1f} below"
         if len(runs) > 2
@@ -188,14 +183,8 @@ def findings(runs: Sequence[ComparedRun]) -> list[Finding]:
         f"{best.error:.1f}"
     )
     numbers = [run.parameters for run in runs]
-    return [
-        reliable,
-        order,
-        Finding(
-            f"{furthest}; the runs use {min(numbers):.1f} to {max(numbers):.1f} effective "
-            "parameters."
-        ),
-    ]
+    used = f"the runs use {min(numbers):.1f} to {max(numbers):.1f} effective parameters"
+    return [reliable, order, Finding(f"{furthest}; {used}.")]
 
 
 def compare_runs(runs: Sequence[str | Path], output: str | Path | None = None) -> list[ComparedRun]:
@@ -206,8 +195,7 @@ def compare_runs(runs: Sequence[str | Path], output: str | Path | None = None) -
         output: folder for the table, the numbers and the page.
 
     Raises:
-        ValueError: as `compare_posteriors`, or the folder cannot be
-            made.
+        ValueError: as `compare_posteriors`, or the folder cannot be made.
     """
     with output_folder(output) as folder:
         with activity.announced(f"Comparing {len(runs)} runs"):
