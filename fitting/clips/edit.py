@@ -2,17 +2,12 @@
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
-from jaxik.world.skeleton import Rig
-
 from . import contacts, rigs
 from .clip import Clip, local_from_world, world_from_local
-from .joint_maps import partners
 from .rigs import with_sole, with_soles
 
 MARKER_JUMP = 0.02  # m: a second difference at `MARKER_RATE` that no body produces
@@ -23,12 +18,6 @@ JUMP = 4.0  # times the median step: the step from a T-pose into the motion
 RAMP_SECONDS = 0.1  # duration of a filter's ramp out of a T-pose
 RAMP_SPEED = 2.0  # times the median step
 RAMP_GAP = 0.02  # s: a ramp that overshoots slows down for as long
-MIRROR_VECTOR = np.array([-1.0, 1.0, 1.0])
-MIRROR_ROTATION = np.array([1.0, 1.0, -1.0, -1.0])  # wxyz
-MIRRORED = (  # of a rig, what the legs of a mirror image exchange
-    "knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "ankle_height", "ball_height",
-    "present",
-)  # fmt: skip
 
 
 def resample(clip: Clip, fps: float) -> Clip:
@@ -108,16 +97,6 @@ def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
     return clip.select(slice(round(start * clip.fps), round(last * clip.fps) + 1))
 
 
-def drop_t_pose(clip: Clip) -> Clip:
-    """The clip without a leading T-pose, the ramp out of it, and trailing repeated frames.
-
-    Masked frames at both ends are left out as well.
-    """
-    first, last = motion_span(clip)
-    whole = (first, last) == (0, clip.frame_count - 1)
-    return clip if whole else clip.select(slice(first, last + 1))
-
-
 def observed_span(clip: Clip) -> tuple[int, int]:
     """First and last frame that is not masked; those of the clip if all are."""
     observed = np.flatnonzero(clip.observed)
@@ -125,11 +104,12 @@ def observed_span(clip: Clip) -> tuple[int, int]:
 
 
 def motion_span(clip: Clip) -> tuple[int, int]:
-    """First and last frame that `drop_t_pose` keeps.
+    """First and last frame without a leading T-pose and the ramp out of it, and repeated ones.
 
-    A clip starts with a T-pose if most of the joints that turn are at rest in its first frame and
-    some joint then jumps, relative to the root, by several times its usual step. The frames after
-    the jump are a ramp as long as they move faster than the clip usually does.
+    Masked frames at both ends are left out as well. A clip starts with a T-pose if most of the
+    joints that turn are at rest in its first frame and some joint then jumps, relative to the root,
+    by several times its usual step. The frames after the jump are a ramp as long as they move
+    faster than the clip usually does.
     """
     start, end = observed_span(clip)
     clip = clip.select(slice(start, end + 1))
@@ -211,45 +191,6 @@ def mask_marker_jumps(clip: Clip) -> Clip:
     """The clip with frames in which a marker jumps masked, in addition to those masked already."""
     good = ~marker_jumps(clip)
     return replace(clip, mask=clip.observed & good)
-
-
-def mirror(clip: Clip) -> Clip:
-    """The mirror image of the clip: x negated, left and right swapped.
-
-    Raises:
-        ValueError: the skeleton is not symmetric.
-    """
-    other = partners(clip.joint_names)
-    if any(
-        (other[parent] if parent >= 0 else -1) != clip.parents[other[joint]]
-        for joint, parent in enumerate(clip.parents)
-    ) or any(other[other[joint]] != joint for joint in range(len(other))):
-        raise ValueError(
-            f"{clip.source}: cannot be mirrored, as left and right differ among the joints "
-            f"{list(clip.joint_names)}"
-        )
-    swap = list(other)
-    rig, rest = clip.measured_rig, clip.rest_rotations_ls
-    legs = partners(rig.names) if rig else ()
-    return replace(
-        clip,
-        offsets_ls=clip.offsets_ls[swap] * MIRROR_VECTOR,
-        positions_ws=clip.positions_ws[:, swap] * MIRROR_VECTOR,
-        rotations_ws=clip.rotations_ws[:, swap] * MIRROR_ROTATION,
-        rest_rotations_ls=None if rest is None else rest[swap] * MIRROR_ROTATION,
-        measured_rig=_mirror_rig(rig, list(legs)) if rig else None,
-        stance=None if clip.stance is None else clip.stance[:, list(legs)],
-    )
-
-
-def _mirror_rig(rig: Rig, legs: list[int]) -> Rig:
-    """The rig with each leg's mirrored counterpart; names, joints and sides stay in place."""
-    with jax.enable_x64(True):
-        swapped = {name: np.asarray(getattr(rig, name))[legs] for name in MIRRORED}
-        # A rotation about an axis becomes the opposite rotation about the mirrored axis.
-        swapped["knee_axis_ls"] = swapped["knee_axis_ls"] * MIRROR_ROTATION[1:]
-        swapped["ankle_from_foot"] = swapped["ankle_from_foot"] * MIRROR_ROTATION
-        return replace(rig, **{name: jnp.asarray(value) for name, value in swapped.items()})
 
 
 def _rotation(rotations: np.ndarray) -> Rotation:

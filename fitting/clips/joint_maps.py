@@ -233,27 +233,6 @@ def _end_of_foot(parents: tuple[int, ...], ankle: int) -> int:
     return parents.index(ankle) if ankle in parents else ankle
 
 
-def partners(names: tuple[str, ...]) -> tuple[int, ...]:
-    """For each joint or leg the index of its counterpart on the other side, or its own index."""
-    return tuple(
-        next((names.index(other) for other in _other_sides(name) if other in names), index)
-        for index, name in enumerate(names)
-    )
-
-
-def _other_sides(name: str) -> list[str]:
-    """What the same joint may be called on the other side."""
-    opposite = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
-    opposite |= {right: left for left, right in opposite.items()}
-    word = re.search(r"left|right", name, re.IGNORECASE)
-    if word and word[0] in opposite:
-        return [name[: word.start()] + opposite[word[0]] + name[word.end() :]]
-    others = []
-    for match in re.finditer(r"^[lr]|(?<=[:_ .])[lr](?![a-z])|(?<=[_ .])[lr]$|[lr]$", name, re.I):
-        others.append(name[: match.start()] + opposite[match[0]] + name[match.end() :])
-    return others
-
-
 @dataclass(frozen=True)
 class Match:
     """A pelvis and a pair of legs that a convention names, by index."""

@@ -19,7 +19,6 @@ from fitting.clips.joint_maps import (
     Trunk,
     find_roles,
     find_trunk,
-    partners,
     read_joint_map,
     template,
 )
@@ -28,6 +27,7 @@ from fitting.clips.rigs import LegMotion
 from fitting.clips.summary import as_json, as_text, describe
 from fitting.motion.flat_animation import load_flat_animation
 from jaxik.world.skeleton import Transform, forward_kinematics
+from support.bodies import without_t_pose
 from support.sample_clips import BVH, flat_floor, stair_walk
 
 # A prefix; then pelvis, hip, knee, ankle and toe, with {} for what says left or right.
@@ -157,10 +157,6 @@ def test_any_number_of_legs_can_be_named_and_the_end_of_a_suffix_decides_the_sid
     assert [leg.side for leg in legs] == list(sides.values())
     assert [leg.name for leg in legs[2:6]] == ["fore_left", "fore_right", "left", "right"]
     assert legs[2].joints == (9, 10, 11, 12)
-    # Partners are the joints of the other side.
-    pairs = "lfemur rfemur LeftLeg RightLeg Foot_L Foot_R LThumb RThumb left_hip right_hip "
-    names = (*(pairs + "rig:l_hand rig:r_hand").split(), "lowerback", "root", "head")
-    assert partners(names) == (1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 12, 13, 14)
 
 
 def test_the_error_for_a_wrong_joint_map_says_what_is_wanted(tmp_path):
@@ -562,9 +558,7 @@ def test_a_t_pose_its_ramp_and_repeated_last_frames_are_dropped(tmp_path, walk, 
     (tmp_path / "t.bvh").write_text(head + text)
     clip = load_clip(tmp_path / "t.bvh")
     assert edit.motion_span(clip) == (1 + ramp, ramp + 40)
-    moving = edit.drop_t_pose(clip)
-    assert moving.frame_count == 40
-    assert edit.drop_t_pose(moving) is moving
+    assert edit.motion_span(without_t_pose(clip)) == (0, 39)
     warnings = describe(clip)["warnings"]
     assert f"starts with a T-pose; the motion begins at frame {1 + ramp}" in warnings
     assert "the last frame is repeated 2 times" in warnings
@@ -573,7 +567,7 @@ def test_a_t_pose_its_ramp_and_repeated_last_frames_are_dropped(tmp_path, walk, 
     jump = np.eye(walk.frame_count)[0][:, None, None] * np.eye(3)[0] * np.arange(9.0)[:, None]
     jumping = walk.with_motion(walk.positions_ws + jump, bare)
     for other in (walk, walk.select(np.zeros(5, int)), jumping):
-        assert edit.drop_t_pose(other) is other
+        assert edit.motion_span(other) == (0, other.frame_count - 1)
 
 
 def test_a_marker_that_jumps_is_masked(walk):
@@ -588,35 +582,17 @@ def test_a_marker_that_jumps_is_masked(walk):
     assert any("markers jump in 3 frames" in warning for warning in describe(jumping)["warnings"])
 
 
-def test_a_clip_mirrored_twice_is_the_clip_and_without_symmetry_it_is_refused(walk):
-    rig = replace(walk.measured_rig, thigh=walk.measured_rig.thigh + np.array([0.0, 0.1]))
-    uneven = replace(walk, measured_rig=rig)
-    once = edit.mirror(uneven)
-    assert np.allclose(once.joints_ws(2)[:, 0], uneven.joints_ws(2)[:, 1] * [-1, 1, 1])
-    assert np.allclose(once.rig.thigh, uneven.rig.thigh[::-1])
-    assert np.array_equal(once.stance_labels(), uneven.stance_labels()[:, ::-1])
-    assert once.rig.side.tolist() == [1, -1]
-    twice = edit.mirror(once)
-    assert np.array_equal(twice.positions_ws, uneven.positions_ws)
-    assert np.array_equal(twice.rotations_ws, uneven.rotations_ws)
-    assert np.array_equal(twice.rig.thigh, uneven.rig.thigh)
-    names = tuple(name.replace("right_knee", "peg") for name in walk.joint_names)
-    parents = tuple(0 if name == "peg" else walk.parents[j] for j, name in enumerate(names))
-    with pytest.raises(ValueError, match="cannot be mirrored.*peg"):
-        edit.mirror(replace(walk, joint_names=names, parents=parents))
-
-
-def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
+def test_the_mirror_image_of_a_body_is_measured_as_the_mirror_image_of_its_rig(mocap):
     clip = load_clip(mocap / "clips/cmu_asfamc/02_03.amc")
-    once = edit.mirror(clip)
-    roles = find_roles(once.joint_names, once.parents)
-    positions, rotations = np.array(once.positions_ws), np.array(once.rotations_ws)
-    stances = detect_stances(once.joints_ws(3), once.fps)
-    again = rigs.measure_rig(roles, positions, rotations, stances)
-    for name in ("knee_axis_ls", "thigh", "shin", "foot"):
-        assert np.allclose(getattr(again, name), getattr(once.rig, name), atol=1e-6)
-    gap = np.abs(np.sum(np.asarray(again.ankle_from_foot * once.rig.ankle_from_foot), axis=-1))
-    assert gap.min() > 1 - 1e-9
+    flip, turn = np.array([-1.0, 1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    roles = find_roles(clip.joint_names, clip.parents)
+    other = replace(roles, legs=tuple(replace(leg, side=-leg.side) for leg in roles.legs))
+    stances = detect_stances(clip.joints_ws(3), clip.fps)
+    rig = rigs.measure_rig(other, clip.positions_ws * flip, clip.rotations_ws * turn, stances)
+    for name, sign in (("knee_axis_ls", turn[1:]), ("thigh", 1), ("shin", 1), ("foot", 1)):
+        assert np.allclose(getattr(rig, name), sign * getattr(clip.rig, name), atol=1e-6)
+    gap = np.sum(np.asarray(rig.ankle_from_foot * clip.rig.ankle_from_foot) * turn, axis=-1)
+    assert np.abs(gap).min() > 1 - 1e-9
 
 
 def test_marker_pops_and_t_poses_of_the_reference_files(mocap):

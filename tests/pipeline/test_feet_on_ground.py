@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.clips import Clip, clip_frames, contacts, load_clip
-from fitting.clips.edit import drop_t_pose, resample
+from fitting.clips.edit import resample
 from fitting.synthetic import footsteps, walker
 from jaxik.maths import quat
 from jaxik.world import terrain
 from reference import maths, sample_poses
+from support.bodies import without_t_pose
 from support.cases import QUICK, stacked
 from support.clips import FLAT, animate, at, make_rig, to_frames, to_ik, to_rig, to_terrain
 
@@ -44,7 +45,7 @@ def solve(preset: str, rig: jaxik.Rig, frames: jaxik.Frame) -> jaxik.Result:
 @functools.cache
 def captured(path: Path) -> Clip:
     """The first four seconds; the last frame is repeated where a clip is shorter."""
-    clip = resample(drop_t_pose(load_clip(path)), FPS)
+    clip = resample(without_t_pose(load_clip(path)), FPS)
     clip = dataclasses.replace(clip, stance=clip.stance_labels())
     return clip.select(np.minimum(np.arange(FRAMES), clip.frame_count - 1))
 

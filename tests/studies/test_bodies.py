@@ -27,7 +27,7 @@ from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world import body, terrain
-from support.bodies import scaled, with_shins
+from support.bodies import scaled, with_shins, without_t_pose
 from support.experiments import ROOT, write
 from support.grounds import edges_between_footfalls, flight, hill, terrain_of
 
@@ -52,7 +52,7 @@ def walk() -> Clip:
 def captured() -> Clip:
     if not CAPTURED.is_file():
         pytest.skip(f"captured clips are not at {CAPTURED.parent}")
-    return edit.resample(edit.drop_t_pose(load_clip(CAPTURED)), 60.0)
+    return edit.resample(without_t_pose(load_clip(CAPTURED)), 60.0)
 
 
 @jax.jit

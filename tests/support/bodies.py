@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.clips import edit
 from fitting.clips.assemble import JointMotion, clip_from_joints
 from fitting.clips.clip import Clip
 from fitting.motion.flat_animation import with_rigid_legs
@@ -46,3 +47,9 @@ def _measured(clip: Clip) -> Clip:
         clip.stance_labels(), clip.fps,
     )  # fmt: skip
     return clip_from_joints(motion, clip.source, joints)
+
+
+def without_t_pose(clip: Clip) -> Clip:
+    """The part of a clip in which something moves."""
+    first, last = edit.motion_span(clip)
+    return clip.select(slice(first, last + 1))
