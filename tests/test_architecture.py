@@ -2,7 +2,9 @@
 
 import ast
 import functools
+import re
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -98,6 +100,13 @@ def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files():
     allowed = {*LIBRARIES_OF_JAXIK, *sys.stdlib_module_names, "jaxik"} - {"os", "pathlib"}
     foreign = {name_of(path): imported_packages(path) - allowed for path in package("jaxik").files}
     assert not {path: names for path, names in foreign.items() if names}
+
+
+def test_jaxik_alone_requires_its_libraries_and_no_more():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {re.split("[>=<]", text)[0].replace("-", "_") for text in project["dependencies"]}
+    assert required == LIBRARIES_OF_JAXIK
+    assert "trimesh>=4.5" in project["optional-dependencies"]["fit"]
 
 
 @pytest.mark.parametrize(("library", "module"), ONLY_IMPORTED_BY.items())

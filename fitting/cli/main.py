@@ -16,7 +16,7 @@ from .parser import make_parser
 from .terminal import watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
-MISTAKE, INTERRUPTED = 2, start.INTERRUPTED  # exit statuses
+MISTAKE, INTERRUPTED = start.MISTAKE, start.INTERRUPTED  # exit statuses
 # Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
 # thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
 COLLECTIONS = (200_000, 10, 10)

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-INTERRUPTED = 130  # exit status
+MISTAKE, INTERRUPTED = 2, 130  # exit statuses
 AGAIN = 0.05  # s until an interrupt that was lost is raised again
 SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
 
@@ -22,9 +22,16 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # the last thing that is done
         signal.signal(signal.SIGINT, end)
-    from .main import main as run
+    try:
+        from .main import main as run
 
-    return run()
+        return run()
+    except ModuleNotFoundError as error:
+        package = str(error.name).partition(".")[0]
+        if package in ("jaxik", "fitting"):
+            raise
+        say(f'needs {package}: pip install "jaxik[fit]"')
+        return MISTAKE
 
 
 def end(*_: object) -> None:

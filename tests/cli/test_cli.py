@@ -537,6 +537,14 @@ def test_bash_completes_commands_options_choices_and_files(tmp_path, capsys):
     assert dict(zip(COMPLETED, offered, strict=True)) == COMPLETED
 
 
+def test_without_what_fits_need_the_command_says_what_to_install():
+    program = "import sys; sys.modules['scipy'] = None\nfrom fitting.cli.start import main; main()"
+    command = [sys.executable, "-c", program, "inspect", "no.bvh"]
+    said = subprocess.run(command, capture_output=True, text=True)
+    assert 'jaxik inspect: needs scipy: pip install "jaxik[fit]"' in said.stderr
+    assert "Traceback" not in said.stderr
+
+
 def test_there_is_a_script_for_each_shell_and_without_shtab_a_word_on_what_to_install(
     monkeypatch, capsys
 ):
