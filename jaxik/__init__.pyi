@@ -20,6 +20,7 @@ from .pipeline import resume as resume
 from .pipeline import run as run
 from .pipeline import step as step
 from .world.frame import Frame as Frame
+from .world.live import FrameBuilder as FrameBuilder
 from .world.skeleton import LegPose as LegPose
 from .world.skeleton import Rig as Rig
 from .world.skeleton import Transform as Transform

@@ -4,6 +4,7 @@ from . import cells as cells
 from . import frame as frame
 from . import grid as grid
 from . import heightfield as heightfield
+from . import live as live
 from . import places as places
 from . import similarity as similarity
 from . import skeleton as skeleton

@@ -1,6 +1,7 @@
 """Transforms, joint trees with forward kinematics, rigs and leg poses."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -173,6 +174,39 @@ class Rig:
     """Hip knee ankle toe."""
     pelvis: int = eqx.field(static=True)
     """Joint index."""
+
+    @classmethod
+    def from_pose(cls, pose: LegPose) -> "Rig":
+        """The legs of a body that stands on y = 0, faces +z, and bends its knees forward.
+
+        Soles are flat and feet point from ankle to toe. Knees may be straight.
+
+        Args:
+            pose: of that body (legs), model space, of NumPy or JAX arrays.
+        """
+        pose = jax.tree.map(jnp.asarray, pose)
+        legs, floats = len(pose.hip.pos), pose.hip.pos.dtype
+        opens = jnp.broadcast_to(jnp.asarray((-1.0, 0.0, 0.0), floats), (legs, 3))
+        thigh, shin = bone_lengths(pose)
+        foot = pose.toe.pos - pose.ankle.pos
+        half_yaw = 0.5 * jnp.arctan2(foot[:, 0], foot[:, 2])
+        zero = jnp.zeros_like(half_yaw)
+        model_from_foot = vec.stack(jnp.cos(half_yaw), zero, jnp.sin(half_yaw), zero)
+        x = pose.hip.pos[:, 0]
+        return cls(
+            knee_axis_ls=quat.unrotate(pose.knee.rot, opens),
+            ankle_from_foot=quat.multiply(quat.conjugate(pose.ankle.rot), model_from_foot),
+            thigh=thigh,
+            shin=shin,
+            foot=vec.length(foot),
+            ankle_height=pose.ankle.pos[:, 1],
+            ball_height=pose.toe.pos[:, 1],
+            side=jnp.where(jnp.abs(x) > 0.01 * thigh, jnp.sign(x), 0.0),
+            present=jnp.ones(legs, bool),
+            names=tuple(f"leg {leg}" for leg in range(legs)),
+            joints=tuple((4 * leg, 4 * leg + 1, 4 * leg + 2, 4 * leg + 3) for leg in range(legs)),
+            pelvis=4 * legs,
+        )
 
 
 def bone_lengths(pose: LegPose) -> tuple[Array, Array]:
