@@ -9,6 +9,9 @@ references.
 import dataclasses
 import math
 
+import jax.numpy as jnp
+from jaxtyping import Array
+
 from jaxik.pipeline import FootIK
 from jaxik.stages.contact import (
     HeightContact,
@@ -42,6 +45,13 @@ from jaxik.world.skeleton import Rig
 SLOPES = {"max_pitch": 0.8, "min_pitch": -1.0, "max_roll": 0.45, "min_roll": -0.6}
 """Limits of feet, rad, within which soles lie on slopes of 25 degrees."""
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
+
+
+def _pitch(rig: Rig | None, of_people: float) -> Array | float:
+    """How far a body pitches with the slope: that of four legs and more lies along it."""
+    if rig is None:
+        return of_people
+    return jnp.where(jnp.sum(rig.present, axis=-1) > 3, 1.0, of_people)
 
 
 def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
@@ -84,6 +94,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 spring=True,
                 follow_slopes=True,
             ),
+            lean=SlopeLean(forward_rate=_pitch(rig, -0.30)),
             lock=OffsetLock(
                 hold_ball=True,
                 release_max_angle=math.pi,
@@ -104,8 +115,9 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """ozz-animation's foot IK sample, on a root that takes steps without a jump.
 
     Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
-    (two-bone) and `foot.enabled` (aim). Only the root has memory. `probe.use_toe`, `probe.toe_ls`,
-    `pelvis.vertical_only` and `pelvis.wait_to_rise` serve other systems and change nothing here.
+    (two-bone) and `foot.enabled` (aim). Swinging feet stay on the ground. Only root and fade have
+    memory. `probe.use_toe`, `probe.toe_ls`, `pelvis.vertical_only` and `pelvis.wait_to_rise` serve
+    other systems and change nothing here.
 
     Two inaccuracies of ozz 0.16 are not reproduced: with a weight below 1 its aim goes the longer
     way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as
@@ -204,6 +216,8 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             ),
             contact=SpeedContact(**STANDING),
             target=ContactTarget(foot_height=body.ANKLE),
+            lock=PlantLock(release_distance=0.15, release_angle=0.5),
+            pelvis=LegLengthPelvis(max_length=body.LEG),
             separation=FootSeparation(),
             leg=PoleLeg(),
         )
@@ -229,7 +243,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         ),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),
-        lean=SpineLean(),
+        lean=SpineLean(pelvis_rate=_pitch(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
         pelvis=ReachPelvis(rise_half_life=0.03, fall_half_life=0.03, spring=True),

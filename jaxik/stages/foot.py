@@ -276,7 +276,9 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
     run = vec.dot(across, ahead)
     facing, rising = vec.dot(ankle.normal, up), -vec.dot(ankle.normal, ahead)
     both_hit = (toe.found * ankle.found > 0) & (run > MIN_SOLE)
-    rise, run = jnp.where(both_hit, vec.dot(across, up), rising), jnp.where(both_hit, run, facing)
+    as_normal = vec.safe_divide(run * rising, facing)
+    between = as_normal + toe.found * (vec.dot(across, up) - as_normal)
+    rise, run = jnp.where(both_hit, between, rising), jnp.where(both_hit, run, facing)
     rise, run, facing, rising = vec.stacked_barrier(rise, run, facing, rising)
     pitch = vec.safe_arctan2(rise, run)
     # The part of the normal along the up axis of the pitched foot.

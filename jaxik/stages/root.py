@@ -100,6 +100,11 @@ class GroundRoot(AbstractRoot):
     degrees is a wall or a ledge and does not count yet. A half-life of 0 jumps, as ozz does, and
     looks straight down.
 
+    A roof over the character, or the bench on which it sits, is ground too, but none that carries
+    it: of the highest ground and the highest that is at most `max_step` above where the game has
+    the character, that counts which is nearer to where the character was, at the start to where the
+    game has it. With a half-life of 0, as in ozz, the highest counts.
+
     Without ground, in the air, or with `enabled` off, the character stays as far from where the
     game has it as it was.
     """
@@ -138,14 +143,19 @@ class GroundRoot(AbstractRoot):
         low=0.1,
         high=1.0,
         kind="threshold",
-        doc="Step beyond which the ground ahead does not count yet.",
+        doc="Step beyond which ground ahead does not count yet and ground above may be a roof.",
     )
 
     def init(self, rig: Rig) -> RootState:
         zero = jnp.zeros((), rig.side.dtype)
         return RootState(zero, zero, zero)
 
-    def sense(self, inputs: Inputs) -> RootGround:
+    def sense(self, inputs: Inputs) -> tuple[RootGround, RootGround]:
+        lower = jnp.where(self.max_step < self.ray_up, self.max_step, self.ray_up)
+        return self._ground(inputs, self.ray_up), self._ground(inputs, lower)
+
+    def _ground(self, inputs: Inputs, ray_up: Array) -> RootGround:
+        """The ground below a height over the origin, m."""
         frame, gate, up = inputs.frame, inputs.gate, inputs.terrain.up_ws
         origin = frame.world_from_model.pos
         # Of a critically damped spring behind a ramp, s; each frame moves to its own end.
@@ -153,8 +163,8 @@ class GroundRoot(AbstractRoot):
         lag = jnp.where(lag > 0, lag, 0.0)
         travel = vec.scale(vec.reject(frame.velocity_ws, up), lag)
         points = jnp.stack([origin, origin + travel])
-        above = points + vec.scale(up, self.ray_up)
-        hits = cast(inputs.terrain.body, above, self.ray_up + self.ray_down, self.layers)
+        above = points + vec.scale(up, ray_up)
+        hits = cast(inputs.terrain.body, above, ray_up + self.ray_down, self.layers)
         hit = jax.tree.map(lambda leaf: leaf[0], hits)
         height, ahead = vec.unstack(vec.dot(hits.point, up))
         step = jnp.abs(ahead - height) - vec.length(travel)
@@ -167,6 +177,25 @@ class GroundRoot(AbstractRoot):
         return RootGround(vec.dot(origin, up), height, ahead, speed, rise, found)
 
     def advance(
+        self, now: Moment, sensed: tuple[RootGround, RootGround], state: RootState
+    ) -> tuple[RootState, Float[Array, ""]]:
+        return self._follow(now, self._carrying(now, *sensed, state), state)
+
+    def _carrying(
+        self, now: Moment, highest: RootGround, lower: RootGround, state: RootState
+    ) -> RootGround:
+        """The ground that carries the character."""
+
+        def away(ground: RootGround) -> Array:
+            before = jnp.where(now.started, state.height + ground.rise, ground.origin)
+            return jnp.abs(ground.height - before)
+
+        # The same ground counts as the highest: rays from there see more of what is ahead.
+        nearer = now.gate.below(away(lower), away(highest) - HEIGHT_BAND, band=HEIGHT_BAND)
+        nearer *= lower.found * jnp.where(self.half_life > 0, 1.0, 0.0)
+        return jax.tree.map(lambda low, high: now.gate.choose(nearer, low, high), lower, highest)
+
+    def _follow(
         self, now: Moment, sensed: RootGround, state: RootState
     ) -> tuple[RootState, Float[Array, ""]]:
         gate, before = now.gate, state.height + sensed.rise

@@ -51,7 +51,8 @@ OffsetLock: release_min_angle rad 0.8726646 0 1.8; release_max_angle rad 3.00196
   release_heading rad 3.141593 0.1 3.141593; release_speed m/s inf 0 3; relock_threshold 1 0.2 0 1;
   max_speed m/s inf 0 3; lock_half_life s 0.05 0.002 0.5; unlock_half_life s 0.1 0.002 0.5;
   return_speed m/s inf 0.1 3
-PlantLock: plant_weight 1 1 0 1; plant_speed 1/s inf 0.1 20
+PlantLock: plant_weight 1 1 0 1; plant_speed 1/s inf 0.1 20; release_distance m inf 0 0.5;
+  release_angle rad 3.141593 0.1 3.141593; release_time s 0.3 0.05 1
 CapsulePelvis: half_height m 0.9 0.3 2
 LegLengthPelvis: min_length m 0.5 0 1; max_length m 0.88 0.2 1.5; speed 1/s 10 0.5 30
 LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95
@@ -115,8 +116,8 @@ unreal!: IdleContact; GroundRoot enabled=no; StrideWarp; RootProbe limited=no; R
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade
 mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; GroundRoot; StrideWarp;
   CornerProbe by_speed=yes extra_min=-0.03 stable_height=0.095 stable_speed=0.25;
-  ContactTarget foot_height=0.085; NoLean; PlantLock; FootSeparation; LegLengthPelvis; FadeEffector;
-  PoleLeg; FlatFoot; SpeedFade
+  ContactTarget foot_height=0.085; NoLean; PlantLock release_distance=0.15 release_angle=0.5;
+  FootSeparation; LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg; FlatFoot; SpeedFade
 mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no; ContactTarget;
   NoLean; PlantLock; NoSeparation; LegLengthPelvis; FadeEffector; HintLeg; FlatFoot; NoFade
 stride: LabelContact; KeepRoot; StrideWarp;

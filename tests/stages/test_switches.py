@@ -166,8 +166,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         STANDING,
     ),
 }
-# In `test_own_rules` and `test_limits`.
-IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius")
+# In `test_own_rules`, `test_limits` and `tests/pipeline/test_situations.py`.
+IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
 
 
 @functools.cache

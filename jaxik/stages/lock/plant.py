@@ -12,6 +12,10 @@ from jaxik.world.terrain import cast
 
 from .base import LEAST, AbstractLock, Hold
 
+DISTANCE_BAND = 0.01  # m
+ANGLE_BAND = 0.035  # rad, 2 degrees
+HOLD_BAND = 0.1
+
 
 @struct
 class PlantState:
@@ -21,6 +25,8 @@ class PlantState:
     """0 or 1."""
     weight: Float[Array, " legs"]
     """0..1, how much of the planting is applied."""
+    hold: Float[Array, " legs"]
+    """0..1, how much of it is left to a foot that is let go."""
     foothold: Float[Array, "legs 3"] = place("point")
     """m, world space."""
     clearance: Float[Array, " legs"]
@@ -38,6 +44,10 @@ class PlantLock(AbstractLock):
     with it where the ground is a platform. The weight of planting moves to `plant_weight` at
     `plant_speed`: set it to 0 or 1 between steps to turn planting off or on over time, at once if
     the speed is infinite.
+
+    A foot that its animation leaves, by more than `release_distance` or `release_angle`, is let go:
+    it goes to where it would be without the lock in `release_time`, and is then planted anew. In
+    the original, nothing but a lost ground lets go of a foot.
     """
 
     plant: Leaf = switch(True, doc="Whether a foot stays where it first stood on ground.")
@@ -53,10 +63,30 @@ class PlantLock(AbstractLock):
         doc="Rate at which planting moves to its weight; infinite sets it at once.",
     )
 
+    release_distance: Leaf = parameter(
+        float("inf"),
+        unit="m",
+        low=0.0,
+        high=0.5,
+        kind="threshold",
+        doc="A planted foot is let go if its foothold would be this far from it.",
+    )
+    release_angle: Leaf = parameter(
+        3.1415926536,
+        unit="rad",
+        low=0.1,
+        high=3.1415926536,
+        kind="threshold",
+        doc="A planted foot is let go if it would be turned away from it by this angle.",
+    )
+    release_time: Leaf = parameter(
+        0.30, unit="s", low=0.05, high=1.0, doc="Time in which a foot that is let go is free."
+    )
+
     def init(self, rig: Rig) -> PlantState:
         zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
         identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
-        return PlantState(zero, zero, zeros, zero, identity)
+        return PlantState(zero, zero, jnp.ones_like(zero), zeros, zero, identity)
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
@@ -81,11 +111,23 @@ class PlantLock(AbstractLock):
         locked = jnp.where(plants, sensed.foothold.found * stands, 0.0)
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         weight = smoothing.move_towards(state.weight, self.plant_weight, step)
-        planting = locked * weight
-        hold = Hold(
+        hold = self._hold(now, planted_ws - foothold_ws, kept_rot, state.hold)
+        locked *= jnp.where(hold > 0, 1.0, 0.0)
+        hold = jnp.where(locked > 0, hold, 1.0)
+        planting = locked * weight * hold
+        after = PlantState(locked, weight, hold, planted_ws, clearance, kept_rot)
+        return after, Hold(
             vec.scale(planted_ws - foothold_ws, planting),
             quat.nlerp(sensed.rot_ws, kept_rot, planting),
             locked,
         )
-        after = PlantState(locked, weight, planted_ws, clearance, kept_rot)
-        return after, hold
+
+    def _hold(self, now: SensedMoment, away_ws: Array, kept_rot: Array, before: Array) -> Array:
+        """How much of its lock is left to a foot, 0..1, that is `away_ws`, m, from its foothold."""
+        gate = now.gate
+        turned = quat.angle(now.sensed.rot_ws, kept_rot)
+        near = gate.below(vec.length(away_ws), self.release_distance, band=DISTANCE_BAND)
+        near *= gate.below(turned, self.release_angle, band=ANGLE_BAND)
+        near = gate.choose(gate.below(1.0 - before, 0.0 * before, band=HOLD_BAND), near, 0.0 * near)
+        step = smoothing.step_of_time(self.release_time, now.dt)
+        return gate.choose(near, before, smoothing.move_towards(before, 0.0 * before, step))

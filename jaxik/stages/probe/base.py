@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Rule
-from jaxik.maths.smoothing import lerp
+from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world.frame import (
     FORWARD,
@@ -24,6 +24,8 @@ from jaxik.world.frame import (
 )
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain
+
+SAME_STEP, SAME_FADE = 0.05, 0.03  # m, between hits under one sole, and over which it fades
 
 Ground = TypeVar("Ground", Terrain, LegTerrains)
 
@@ -97,6 +99,18 @@ def or_level(hit: Hit, found: Array, level_ws: Array) -> Hit:
     weight = hit.found * found
     point = lerp(level_ws, hit.point, weight[..., None])
     return Hit(point, hit.normal, hit.distance, weight, hit.platform)
+
+
+def on_same_ground(hit: Hit, foot: Hit, up_ws: Array) -> Hit:
+    """A hit beside that of its foot, less found the higher the step is between them.
+
+    A toe over a ledge is not to pitch its foot into it, nor one before a riser onto it.
+    """
+    way = hit.point - foot.point
+    # Off the foot's ground along its normal, and so along up.
+    step = vec.safe_divide(vec.dot(way, foot.normal), vec.dot(foot.normal, up_ws))
+    same = 1.0 - smoothstep((jnp.abs(step) - SAME_STEP) / SAME_FADE)
+    return with_weight(hit, hit.found * jnp.where(foot.found > 0, same, 1.0))
 
 
 def make_rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:

@@ -14,6 +14,7 @@ from .base import (
     foot_heading,
     make_rays,
     no_hit,
+    on_same_ground,
     or_level,
     separate,
     toe_point,
@@ -66,6 +67,8 @@ class FootProbe(AbstractLimitedProbe):
         starts = (ankle_ws + above, toe_ws + above)
         ankle, toe = separate(self.cast(inputs, jnp.stack(starts), reach, self.layers))
         toe = with_weight(toe, jnp.where(self.use_toe, toe.found, 0.0))
+        if self.limited:
+            toe = on_same_ground(toe, ankle, terrain.leg_up_ws)
         rays = make_rays(ankle, self.ray_up, self.ray_down, self.layers)
         return GroundHits(ankle, toe, no_hit(ankle), jnp.zeros_like(ankle.found), rays)
 
@@ -204,11 +207,12 @@ class CornerProbe(AbstractLimitedProbe):
         ahead, right = foot_heading(inputs, up)
         over = sole + vec.scale(up, foot_height)
         sides = (vec.scale(ahead, self.foot_length), vec.scale(right, self.half_width))
+        beside = hits_below(*(over + offset for offset in sides))
+        if self.limited:
+            beside = [on_same_ground(hit, ankle, up) for hit in beside]
         toe, corner = (
             or_level(hit, ankle.found, sole + offset)
-            for hit, offset in zip(
-                hits_below(*(over + offset for offset in sides)), sides, strict=True
-            )
+            for hit, offset in zip(beside, sides, strict=True)
         )
         rays = make_rays(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
         return GroundHits(ankle, toe, corner, jnp.zeros_like(ankle.found), rays)

@@ -19,6 +19,7 @@ AS_IT_COMES = (
     | named("probe", stable_height=0.12, stable_speed=0.5, layers=ALL_LAYERS)
     | {"target.foot_height": 0.10, "effector.transition_time": 0.2}
     | named("lock", plant=True, plant_weight=1.0, plant_speed=math.inf)
+    | named("lock", release_distance=math.inf, release_angle=math.pi, release_time=0.3)
     | named("pelvis", enabled=True, min_length=0.5, max_length=0.88, damp=True, speed=10.0)
     | {"leg.soften": 1.0, "leg.twist": 0.0, "leg.weight": 1.0, "foot.max_tilt": math.radians(45.0)}
 )
@@ -29,7 +30,8 @@ STANDS_BY_SPEED = (
     | ground.BY_SPEED
     | named("contact", planted_height=0.09, raised_height=0.12, raised_speed=0.35)
     | named("probe", by_speed=True, stable_speed=0.25, stable_height=0.095, extra_min=-0.03)
-    | {"target.foot_height": 0.085}
+    | {"target.foot_height": 0.085, "pelvis.max_length": 0.84}
+    | named("lock", release_distance=0.15, release_angle=0.5)
 )
 """As it comes."""
 
@@ -59,6 +61,7 @@ class Memory:
     kept_point: Array  # m
     kept_rot: Array  # from the axes of the foot to the world
     standing: Standing | None  # None where all feet always stand
+    hold: float = 1.0  # what is left of the planting of a foot that is let go
     fade: float = 0.0
     # From the animated ankle, m, and its rotation to the last goal.
     offset_ws: Array = field(default_factory=lambda: np.zeros(3))
@@ -205,15 +208,29 @@ def plant(foot: Foot, before: Memory | None) -> tuple[Memory, Array, Array]:
     rot = flat_foot(foot) if foot.found else foot.world_from_foot
     stands = standing is None or standing.standing
     planted = bool(foot.found and stands and foot["lock.plant"] and foot.weight > 0.0)
-    kept_point, kept_rot = np.zeros(3), maths.IDENTITY
+    kept_point, kept_rot, hold = np.zeros(3), maths.IDENTITY, 1.0
     if planted:
         kept_point, kept_rot = point, rot
         if before is not None and before.planted:
             kept_point = characters.carried(foot.frame, foot.hit, before.kept_point)
             kept_rot = characters.turned(foot.frame, foot.hit, before.kept_rot)
-        point = point + weight * (followed(foot, kept_point) - point)
-        rot = maths.nlerp(rot, kept_rot, weight)
-    return Memory(weight, planted, kept_point, kept_rot, standing), point, rot
+        stays = followed(foot, kept_point)
+        hold = before.hold if before is not None else 1.0
+        leaves = maths.length(stays - point) > foot["lock.release_distance"]
+        if leaves or hold < 1.0 or turn_between(rot, kept_rot) > foot["lock.release_angle"]:
+            hold = maths.move_towards(hold, 0.0, foot.frame.dt / foot["lock.release_time"])
+        if hold <= 0.0:
+            planted, hold = False, 1.0
+        else:
+            point = point + weight * hold * (stays - point)
+            rot = maths.nlerp(rot, kept_rot, weight * hold)
+    return Memory(weight, planted, kept_point, kept_rot, standing, hold), point, rot
+
+
+def turn_between(a: Array, b: Array) -> float:
+    """Angle from one rotation to another, rad."""
+    between = multiply(maths.inverse(a), b)
+    return 2.0 * math.atan2(maths.length(between[1:]), abs(float(between[0])))
 
 
 def followed(foot: Foot, kept: Array) -> Array:
