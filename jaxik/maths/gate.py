@@ -1,9 +1,10 @@
 """Gates: how a comparison becomes a decision, sharp as in a game or blurred for gradients.
 
-Every decision of the pipeline goes through a gate. `Hard` decides as a game does. `Smooth` blurs,
-for users who want gradients through decisions. Both express a decision as a weight 0..1, so that
-`a * b` is "and" and `1 - a` is "not" with either. Each call states its `band`: the width over which
-a blurred decision changes, in the unit of what is compared.
+What a threshold among the parameters decides goes through a gate; where two formulas meet without a
+jump, a plain `where` chooses. `Hard` decides as a game does. `Smooth` blurs, for users who want
+gradients through decisions. Both express a decision as a weight 0..1, so that `a * b` is "and" and
+`1 - a` is "not" with either. Each call states its `band`: the width over which a blurred decision
+changes, in the unit of what is compared.
 """
 
 import functools

@@ -2,9 +2,9 @@
 
 contact, root, warp, probe, target, lean, lock, separation, pelvis, effector, leg, foot run in this
 order; fade runs after the pelvis and after the effector. A module defines its stage's abstract
-rule, the rules that implement it, and what they remember and return. A rule decides one thing and
-knows nothing of the rules of other stages. Start with `inputs`, what every rule reads, then any
-stage. To write a rule, subclass the abstract rule of its stage.
+rule, the rules that implement it, and what they remember and return. A rule decides one thing, from
+what earlier stages return, whatever their rules. Start with `inputs`, what every rule reads, then
+any stage. To write a rule, subclass the abstract rule of its stage.
 """
 
 import lazy_loader
