@@ -175,7 +175,8 @@ def test_an_ablation_measures_each_clip_with_its_body(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "_errors", errors)
     monkeypatch.setattr(ablation, "summarise", lambda errors: None)
     measured = [(clip, slice(None)), (giant, slice(None))]
-    ablation._fit(experiment, ablation.Split("", [], measured))
+    split = ablation.Split("", [], measured)
+    ablation._fit(ablation.Task("", "", experiment, 0, split))
     assert rays[1] == pytest.approx(2.0 * rays[0], rel=1e-4)
 
 
