@@ -187,7 +187,7 @@ def interrupt(*_, **__) -> Any:
 
 
 def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
-    """The names in its experiment are no paths."""
+    """The names in its experiment are not paths."""
     summary, page = done.run / run_folder.SUMMARY, done.run / pages.PAGE
     assert done.fitted.run == done.run
     assert done.log[0].startswith("fitting 2 parameters of record to 1 clip")
@@ -383,7 +383,7 @@ def test_an_interrupt_before_the_search_writes_nothing(done, tmp_path, monkeypat
 def test_the_exit_status_says_what_is_wrong_with_a_fit(done, tmp_path, monkeypatch):
     for status, interrupted, converged, has_noise, fits, setbacks in (
         (0, False, True, True, True, 0),
-        (0, False, True, False, False, 1),  # what a translation leaves over is no failure
+        (0, False, True, False, False, 1),  # what a translation leaves over is not a failure
         (3, False, False, True, False, 0),
         (4, False, True, True, False, 0),
         (7, False, True, True, False, 1),

@@ -93,7 +93,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
 
     def ours() -> None:
         solution = find_best_fit(problem)
-        if solution.interrupted:  # the search keeps Ctrl-C to itself; half a run is no figure
+        if solution.interrupted:  # the search keeps Ctrl-C to itself; half a run is not a figure
             raise KeyboardInterrupt
         solutions.append(solution)
 

@@ -106,7 +106,7 @@ def count_operations(
 
 
 def _variables(values: Iterable[Any], selected: Iterable[bool]) -> set[Var]:
-    """Those of the selected values that are no constants."""
+    """Those of the selected values that are not constants."""
     pairs = zip(values, selected, strict=False)
     return {value for value, is_selected in pairs if is_selected and isinstance(value, Var)}
 

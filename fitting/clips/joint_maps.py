@@ -338,7 +338,7 @@ def read_joint_map(path: Path) -> dict[str, str]:
     """The joint names in a file by role, as `find_roles` takes them.
 
     Raises:
-        ValueError: the file does not exist or is not TOML, a key is no role, or a value no name.
+        ValueError: the file does not exist or is not TOML, a key is not a role, or a value no name.
     """
     return check_joint_map(validation.read_toml(path, "a joint map"), f"{path}")
 
@@ -347,13 +347,13 @@ def check_joint_map(content: validation.Table, where: str) -> dict[str, str]:
     """The table, if it is a joint map; which joints there are is not known yet.
 
     Raises:
-        ValueError: a key is no role, a value no name, or the pelvis is missing.
+        ValueError: a key is not a role, a value no name, or the pelvis is missing.
     """
     for role, name in content.items():
         if not ROLE.fullmatch(role):
             raise ValueError(
-                f"{where}: {role!r} is no role; wanted pelvis, and hip_NAME, knee_NAME, ankle_NAME "
-                "and toe_NAME of each leg"
+                f"{where}: {role!r} is not a role; wanted pelvis, and hip_NAME, knee_NAME, "
+                "ankle_NAME and toe_NAME of each leg"
             )
         if not TEXT.accepts(name):
             raise ValueError(f"{where}: {role} is {name!r}; wanted the name of a joint")

@@ -35,7 +35,7 @@ class GroundPatch:
 def around_path(clip: Clip, terrain: Terrain) -> GroundPatch:
     """The ground around the path of a clip's pelvis.
 
-    Rays start a little above the character, so that a roof is no ground.
+    Rays start a little above the character, so that a roof is not ground.
 
     Args:
         clip: y up, of one frame or more.

@@ -125,7 +125,7 @@ def load_terrain(
 
     Raises:
         ValueError: no such file, a file that cannot be read or that has no triangles, vertices that
-            are not finite, arrays that are no heightfield, an `up` of zero length, or another
+            are not finite, arrays that are not a heightfield, an `up` of zero length, or another
             argument out of range.
     """
     if file_up not in _WORLD_FROM_FILE:

@@ -173,7 +173,7 @@ class Identifiability:
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """Parameters that the data bound on both sides, in one valley, and well enough."""
+        """Parameters that the data bound on both sides, at one local minimum, and well enough."""
         return tuple(
             name
             for name, contraction in zip(self.names, self.contraction, strict=True)
@@ -187,7 +187,7 @@ class Identifiability:
 
 
 def is_determined(profile: Profile, contraction: float) -> bool:
-    """Whether the data bound a parameter on both sides, in one valley, and well enough."""
+    """Whether the data bound a parameter on both sides, at one local minimum, and well enough."""
     return profile.verdict == "two-sided" and contraction >= UNDETERMINED
 
 

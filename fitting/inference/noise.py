@@ -164,7 +164,7 @@ def information_of_slopes(loss: Loss, tails: float) -> float:
 
     1 for squares. Student's residual has the Fisher information `(nu + 1) / (nu + 3)` (Lange,
     Little and Taylor 1989), while the mean squared slope of its transformed one is larger. Losses
-    that are no distribution count as 1.
+    that are not a distribution count as 1.
     """
     if loss != "student":
         return 1.0

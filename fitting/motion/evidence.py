@@ -164,7 +164,7 @@ def describe_missing_motion(
     leaf = parameter.leaf
     low, high = profile.interval
     if profile.verdict == "several valleys":
-        places = " or ".join(_with_unit(v.value, unit) for v in profile.valleys)
+        places = " or ".join(_with_unit(v.value, unit) for v in profile.minima)
         return f"motion that differs between {places}; which one is not known"
     if leaf in AT_LIMITS:
         is_lowest = leaf.rpartition(".")[2].startswith("min_")

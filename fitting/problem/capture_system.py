@@ -30,7 +30,7 @@ from .problem import Problem
 from .scene import GROUND, Capture, Scene
 from .space import Vector
 
-PREFIX = "capture."  # of the names of what is no parameter of the system
+PREFIX = "capture."  # of the names of what is not a parameter of the system
 
 
 class CapturedSystem(jaxik.FootIK):

@@ -145,7 +145,7 @@ def _write(path: Path, figure: Figure) -> None:
     def fill(temporary: Path) -> None:
         try:
             figure.savefig(temporary, facecolor="white")
-        except ValueError:  # a name of the user's, such as "$x^$", is no mathematics
+        except ValueError:  # a name of the user's, such as "$x^$", is not mathematics
             for text in figure.findobj(Text):
                 text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
             figure.savefig(temporary, facecolor="white")

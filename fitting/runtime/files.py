@@ -46,7 +46,7 @@ def check_output_file(path: Path) -> None:
         ValueError: the path is a folder or a device, or its folder does not exist.
     """
     if path.exists() and not path.is_file():
-        kind = "a folder" if path.is_dir() else "no regular file"
+        kind = "a folder" if path.is_dir() else "not a regular file"
         raise ValueError(f"{path}: cannot be written: it is {kind}")
     if not (folder := _without_link(path).parent).is_dir():
         raise ValueError(f"{path}: cannot be written: there is no folder {folder}")

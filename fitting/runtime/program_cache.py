@@ -160,11 +160,11 @@ def program_key(function: Callable, arguments: Arguments) -> str:
 
     Raises:
         NotPlainError: the function or an argument comes from elsewhere, where source may change
-            unnoticed, or an argument is no plain value.
+            unnoticed, or an argument is not a plain value.
     """
     module, name = function.__module__, function.__qualname__
     if module.partition(".")[0] not in plain_tree.PROJECT or "<" in name:  # <locals>, <lambda>
-        raise plain_tree.NotPlainError(f"{module}.{name} is no named function of this project")
+        raise plain_tree.NotPlainError(f"{module}.{name} is not a named function of this project")
     types = jax.tree.map(lambda leaf: array_type(leaf) if eqx.is_array(leaf) else leaf, arguments)
     settings = [setting("jax_enable_x64"), str(setting("jax_default_matmul_precision"))]
     parts = [

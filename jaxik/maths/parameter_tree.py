@@ -281,7 +281,7 @@ def with_option(module: Tree, name: str, on: bool) -> Tree:
 
 
 def get(module: eqx.Module, name: str) -> Array:
-    """The leaf with this dotted name; options are no leaves."""
+    """The leaf with this dotted name; options are not leaves."""
     return operator.attrgetter(name)(module)
 
 

@@ -42,7 +42,7 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
 
     Args:
         frame: the leaves may have a leading axis of frames.
-        present: the legs that are there, of the rig; what others hold is no fault.
+        present: the legs that are there, of the rig; what others hold is not a fault.
     """
     present = present if frame.rig is None else frame.rig.present
     rank, pose = frame.dt.ndim, frame.pose

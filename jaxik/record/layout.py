@@ -113,7 +113,7 @@ def knee_axis(record: Record) -> np.ndarray:
 
 
 def besides_parameters(record: Record) -> list[str]:
-    """What a record holds that is no parameter of a system: knee axis, padding and tail, in words.
+    """What a record holds that is not a parameter: knee axis, padding and tail, in words.
 
     Padding of zeros and an empty tail are left out.
     """

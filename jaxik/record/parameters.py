@@ -204,7 +204,7 @@ def _from_stored(name: str, value: float, unit: str, record: Record, reading: Re
             return value / 100.0
     if unit == "cosine":
         if abs(value) > 1.0:
-            warnings.warn(f"{name} = {value} is no cosine; it is read as degrees", stacklevel=3)
+            warnings.warn(f"{name} = {value} is not a cosine; it is read as degrees", stacklevel=3)
             angle = np.radians(value)
         else:
             angle = np.arccos(value)

@@ -73,7 +73,7 @@ def playback(late: float, noise: float = 0.0, offset: float = 0.0) -> Any:
         ((0.05,), 0.05),
         ((-0.05, 0.005, 0.03), -0.05),
         ((0.0, 0.01), 0.0),
-        ((0.0, 0.0, 0.05), 0.0),  # an offset is no lag
+        ((0.0, 0.0, 0.05), 0.0),  # an offset is not a lag
         ((0.008,), 0.0),  # a quarter of a frame
         ((0.02, 0.2), 0.0),  # hidden in noise
     ],

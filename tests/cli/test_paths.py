@@ -1,4 +1,4 @@
-"""Every path that a command takes: what is no file to read costs one line, and writes nothing."""
+"""Every path that a command takes: what is not a file to read costs a line, and writes nothing."""
 
 import os
 import re
@@ -73,7 +73,7 @@ WAYS = (
 
 
 def broken_path(way: str, suffix: str) -> str:
-    """A path in this folder that is no file of a kind that a command reads."""
+    """A path in this folder that is not a file of a kind that a command reads."""
     path = Path(f"broken{suffix}")
     match way:
         case "folder":

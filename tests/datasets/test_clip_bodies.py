@@ -177,7 +177,7 @@ def test_the_error_for_a_wrong_joint_map_says_what_is_wanted(tmp_path):
         ("pelvis = ", "not TOML"),
         ("pelvis = 3", "pelvis is 3; wanted the name of a joint"),
         ("[hip_left]\nx = 1", "hip_left is {'x': 1}; wanted the name of a joint"),
-        ("pelwis = 'Hips'", "'pelwis' is no role; wanted pelvis, and hip_NAME"),
+        ("pelwis = 'Hips'", "'pelwis' is not a role; wanted pelvis, and hip_NAME"),
         ("hip_l = 'LeftUpLeg'", "there is no pelvis"),
     ):
         map_file.write_text(text)

@@ -108,7 +108,7 @@ def test_bones_whose_length_jumps_have_swapped_markers_and_no_others(places, tmp
     for name, other in (("LANK", "RANK"), ("RANK", "LANK")):
         swapped[name][30:33] = places[other][30:33]
     assert "from left_knee to left_ankle the distance jumps in 2 frames" in remarks(swapped)
-    # A marker on the shin is no ankle: its distance from the toe changes with the foot.
+    # A marker on the shin is not an ankle: its distance from the toe changes with the foot.
     joints = {"pelvis": "LPSI + RPSI"}
     for side, letter in (("left", "L"), ("right", "R")):
         own = {"hip": "ASI", "knee": "KNE", "ankle": "TIB", "toe": "TOE"}

@@ -1,4 +1,4 @@
-"""Posteriors with several islands: found, weighted, or said to be out of reach."""
+"""Posteriors with several modes: found, weighted, or said to be out of reach."""
 
 import math
 
@@ -14,7 +14,7 @@ from fitting.inference.sample.posterior import Posterior, WalkerStart
 from fitting.problem.problem import Problem
 from support.problems import problem_of_fractions
 
-CENTRES = np.array([-6.0, 6.0])  # of the islands, along the first parameter
+CENTRES = np.array([-6.0, 6.0])  # of the modes, along the first parameter
 WIDTHS = np.array([1.0, 0.3])
 SPREAD = 1.6  # of the prior
 
@@ -28,8 +28,8 @@ def mixture(ik, log_weights):
     return jnp.sqrt(2 * (jnp.max(log_weights) + 1 - log_density))[None]
 
 
-def two_islands(size: int, weights: tuple[float, float]) -> Problem:
-    """A problem whose posterior has islands with exactly these weights."""
+def two_modes(size: int, weights: tuple[float, float]) -> Problem:
+    """A problem whose posterior has modes with exactly these weights."""
     # A normal of this width times the prior has this integral.
     volumes = WIDTHS * stats.norm.pdf(0, 0, np.hypot(SPREAD, WIDTHS))
     drawn_to_prior = -0.5 * CENTRES**2 / (SPREAD**2 + WIDTHS**2)
@@ -38,7 +38,7 @@ def two_islands(size: int, weights: tuple[float, float]) -> Problem:
 
 
 def start_of(size: int, first: int) -> WalkerStart:
-    """Three quarters of the walkers on one island, a quarter on the other."""
+    """Three quarters of the walkers in one mode, a quarter in the other."""
     u = np.zeros((2, size))
     precision = 1 / WIDTHS**2 + 1 / SPREAD**2
     u[:, 0] = CENTRES / WIDTHS**2 / precision
@@ -49,10 +49,10 @@ def sample(problem: Problem, start: WalkerStart, **settings) -> Posterior:
     return posterior.sample_posterior(problem, start, SamplerSettings(**settings))
 
 
-def test_islands_get_their_exact_weights_from_unbalanced_starts():
+def test_modes_get_their_exact_weights_from_unbalanced_starts():
     settings = {"walkers": 24, "max_steps": 2000, "stop_at": 1e9}
-    sampled = sample(two_islands(6, (0.2, 0.8)), start_of(6, 0), **settings)
-    heavy, light = sampled.islands
+    sampled = sample(two_modes(6, (0.2, 0.8)), start_of(6, 0), **settings)
+    heavy, light = sampled.modes
     assert heavy.exchanges > 200 and light.exchanges > 200
     assert heavy.error < 0.025
     assert abs(heavy.weight - 0.8) < 4 * heavy.error
@@ -71,20 +71,20 @@ def no_jumps(monkeypatch) -> None:
 
 @pytest.mark.usefixtures("no_jumps")
 def test_without_jumps_weights_are_out_of_reach_and_nothing_is_left_out():
-    sampled = sample(two_islands(6, (0.8, 0.2)), start_of(6, 1), max_steps=600)
+    sampled = sample(two_modes(6, (0.8, 0.2)), start_of(6, 1), max_steps=600)
     assert not sampled.converged
-    assert "the weights of islands are out of reach" in sampled.message
-    assert sum(island.walkers for island in sampled.islands) == 24
-    assert not any(island.is_weighed for island in sampled.islands)
-    assert all(math.isnan(island.error) for island in sampled.islands)
+    assert "the weights of modes are out of reach" in sampled.message
+    assert sum(mode.walkers for mode in sampled.modes) == 24
+    assert not any(mode.is_weighed for mode in sampled.modes)
+    assert all(math.isnan(mode.error) for mode in sampled.modes)
     assert sampled.isolated == [] and sampled.kept.shape[1] == 24
 
 
-def test_walkers_on_a_negligible_island_come_home():
-    sampled = sample(two_islands(6, (1 - 1e-9, 1e-9)), start_of(6, 0), stop_at=20.0)
+def test_walkers_in_a_negligible_mode_come_home():
+    sampled = sample(two_modes(6, (1 - 1e-9, 1e-9)), start_of(6, 0), stop_at=20.0)
     assert sampled.converged, sampled.message
     assert sampled.u[50, :, 0].max() > 5.0 and sampled.u[-500:, :, 0].max() < 0
-    assert sampled.isolated == [] and sampled.islands == ()
+    assert sampled.isolated == [] and sampled.modes == ()
 
 
 @pytest.mark.usefixtures("no_jumps")
@@ -97,7 +97,7 @@ def test_a_walker_that_cannot_come_home_is_named_with_what_is_left_out(monkeypat
         return centres, widths
 
     monkeypatch.setattr(posterior, "_balls", one_apart)
-    sampled = sample(two_islands(6, (1 - 1e-7, 1e-7)), start_of(6, 0), stop_at=20.0)
+    sampled = sample(two_modes(6, (1 - 1e-7, 1e-7)), start_of(6, 0), stop_at=20.0)
     assert sampled.isolated == [3] and 3 in sampled.stuck
     assert "left out: 1 of 24 walkers" in sampled.message
     assert sampled.converged, sampled.message
@@ -126,7 +126,7 @@ def test_lessons_are_powers_of_two_times_the_first():
 
 
 @pytest.mark.parametrize("size", [1, 2, 6, 17])
-def test_a_posterior_of_one_piece_has_one_island_and_two_of_different_width_are_both_found(size):
+def test_a_posterior_of_one_piece_has_one_mode_and_two_of_different_width_are_both_found(size):
     random = np.random.default_rng(size)
     draws = (150, 4 * max(size, 2), size)
     normal = random.normal(size=draws)
@@ -136,26 +136,26 @@ def test_a_posterior_of_one_piece_has_one_island_and_two_of_different_width_are_
         "ridge": 10 * random.normal(size=(*draws[:2], 1)) + random.normal(size=draws),
         "plateau": random.uniform(size=draws) ** 3,
     }.items():
-        assert len(modes.find_islands(u)) == 1, shape
+        assert len(modes.find_modes(u)) == 1, shape
         assert modes.survey(u, np.zeros(draws[:2])) == (), shape
     few = draws[1] // 8
     many = draws[1] - few
     normal[:, :few] = 0.2 * normal[:, :few] + 15.0 * np.eye(size)[0]
-    labels = modes.find_islands(normal).labels(normal)
+    labels = modes.find_modes(normal).labels(normal)
     assert np.sort(np.bincount(labels.ravel())).tolist() == sorted([150 * few, 150 * many])
     small, large = modes.survey(normal, np.zeros(draws[:2]))[::-1]
     assert (small.exchanges, small.walkers, large.walkers) == (0, few, many)
 
 
-def test_walkers_that_have_not_met_yet_or_never_move_are_no_islands():
+def test_walkers_that_have_not_met_yet_or_never_move_are_not_modes():
     random = np.random.default_rng(0)
     u = 0.1 * random.normal(size=(100, 24, 6)) + 10.0 * random.normal(size=(24, 6))
-    assert len(modes.find_islands(u)) == 1
-    assert len(modes.find_islands(np.ones((50, 8, 2)))) == 1
+    assert len(modes.find_modes(u)) == 1
+    assert len(modes.find_modes(np.ones((50, 8, 2)))) == 1
 
 
 def test_the_density_of_jumps_is_that_of_their_draws():
-    found = modes.Islands(
+    found = modes.Modes(
         np.array([[0.0, 0.0], [9.0, 1.0]]),
         np.array([[[1.0, 0.0], [0.8, 0.5]], [[0.2, 0.0], [0.0, 2.0]]]),
         np.array([0.7, 0.3]),

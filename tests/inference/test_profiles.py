@@ -140,7 +140,7 @@ def test_heights_and_levels_of_a_parabola_are_those_of_chi_square():
     assert max_rise(GAIN, gains(np.zeros(1)), np.zeros(1)) == RISE_OF_SMOOTH
 
 
-def test_a_narrow_valley_does_not_exclude_a_wide_plateau_but_for_one_out_of_reach():
+def test_a_narrow_minimum_does_not_exclude_a_wide_plateau_but_for_one_out_of_reach():
     narrow, prior = 0.5 * (U / 0.005) ** 2, 0.5 * (U / 1.6) ** 2
     height = max_rise(GAIN, gains(U), np.minimum(3.0 + prior, narrow))
     share_of_plateau = np.exp(-3) * 1.6 / (np.exp(-3) * 1.6 + 0.005)
@@ -209,16 +209,16 @@ def test_a_clamp_is_two_sided_if_it_is_reached_and_one_sided_if_it_is_never():
     assert reached.interval[-1] == pytest.approx([0.6, 0.6], abs=0.03)
 
 
-def test_two_valleys_are_listed_with_their_intervals_and_heights():
+def test_two_minima_are_listed_with_their_intervals_and_heights():
     report = bumps()[2]
     square = report.profiles["square"]
     assert square.verdict == "several valleys"
-    left, right = square.valleys
+    left, right = square.minima
     assert left.value == pytest.approx(-0.6, abs=0.03)
     assert right.value == pytest.approx(0.6, abs=0.03)
     assert right.rise == 0 < left.rise < RISE_OF_SMOOTH
-    for valley in square.valleys:
-        assert valley.interval[0] < valley.value < valley.interval[1] < valley.interval[0] + 0.1
+    for minimum in square.minima:
+        assert minimum.interval[0] < minimum.value < minimum.interval[1] < minimum.interval[0] + 0.1
     assert "square" in report.undetermined
 
 
@@ -275,7 +275,7 @@ def test_intervals_go_on_beyond_cliffs_along_which_parameters_move_together(seed
     assert report.profiles["half_life"].interval == pytest.approx(ends, abs=0.15 * np.ptp(ends))
 
 
-def test_cliffs_on_either_side_of_a_valley_are_crossed_alike(monkeypatch):
+def test_cliffs_on_either_side_of_a_minimum_are_crossed_alike(monkeypatch):
     """Of a curve that is the same from left to right and from right to left."""
     problem = problem_of_fractions(1, None, distances)
     tried: list[float] = []

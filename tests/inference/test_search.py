@@ -238,7 +238,7 @@ def test_starts_are_made_until_two_of_them_agree_and_one_alone_has_not_converged
     assert solution.cost <= min(r.cost for r in solution.history) * (1 + ROUNDING)
     alone = search.find_best_fit(curve_problem(), one_descent, starts=1)
     assert not alone.converged
-    assert alone.message == "Not converged: stopped in a valley, where the only start led."
+    assert alone.message == "Not converged: stopped at a local minimum, where the only start led."
     assert (alone.starts, alone.agreeing) == (1, 1)
     with pytest.raises(ValueError, match="starts is 0, wanted at least 1"):
         search.find_best_fit(curve_problem(), starts=0)

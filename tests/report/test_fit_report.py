@@ -25,7 +25,7 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise import NoiseOptions
 from fitting.inference.optimise.solution import Progress, Solution
 from fitting.inference.sample import inference_data
-from fitting.inference.sample.modes import Island
+from fitting.inference.sample.modes import Mode
 from fitting.inference.sample.posterior import Posterior
 from fitting.motion import goodness, playback
 from fitting.problem import residuals
@@ -459,9 +459,9 @@ def text_of(**other: Any) -> str:
     return posterior_report.posterior_text(around_fit(toy_posterior(**other)))
 
 
-def island(weight: float, exchanges: int, u: float) -> Island:
+def mode(weight: float, exchanges: int, u: float) -> Mode:
     error = 0.012 if exchanges >= 20 else math.nan
-    return Island(np.full(2, u), weight, error, exchanges, 4, -12.5)
+    return Mode(np.full(2, u), weight, error, exchanges, 4, -12.5)
 
 
 def first_coordinates(axes) -> tuple[set[float], set[float]]:
@@ -503,20 +503,20 @@ def test_the_legend_of_a_chain_says_how_many_of_its_walkers_are_drawn():
     assert labels == ["walkers (12 of 12 shown)", "burn-in, discarded"]
 
 
-def test_islands_are_shown_with_weights_exchanges_and_medians():
-    found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
-    assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(islands=found)
+def test_modes_are_shown_with_weights_exchanges_and_medians():
+    found = (mode(0.81, 250, 0.0), mode(0.19, 250, 1.5))
+    assert "2 modes: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(modes=found)
     space = space_of(NAMES)
-    sampled = around_fit(toy_posterior(islands=found))
+    sampled = around_fit(toy_posterior(modes=found))
     text = "\n".join(document.markdown(posterior_report.sections(sampled, None)))
     assert "| 1 | 81.0 % ± 1.2 % | 250 | 4 | -12.5 |" in text
     first, second = (np.asarray(space.values(jnp.full(2, u))) for u in (0.0, 1.5))
     assert f"| foot.share | 1 | {first[0]:.4g} | {second[0]:.4g} |" in text
     assert "out of reach" not in text
-    found = (island(0.75, 3, 0.0), island(0.25, 3, 1.5))  # hardly any exchanges
-    text = text_of(islands=found)
+    found = (mode(0.75, 3, 0.0), mode(0.25, 3, 1.5))  # hardly any exchanges
+    text = text_of(modes=found)
     assert "out of reach (75.0 % of the draws), out of reach (25.0 % of the draws)" in text
-    table = markdown(posterior_report.island_table(found))
+    table = markdown(posterior_report.mode_table(found))
     assert "| 2 | out of reach (25.0 % of the draws) | 3 |" in table
 
 

@@ -59,7 +59,7 @@ def test_what_a_link_leads_to_is_written_and_the_link_stays(tmp_path):
     (tmp_path / "astray").symlink_to(tmp_path / "no" / "a.txt")
     with pytest.raises(ValueError, match="astray: cannot be written: there is no folder .*no"):
         files.check_output_file(tmp_path / "astray")
-    with pytest.raises(ValueError, match="null: cannot be written: it is no regular file"):
+    with pytest.raises(ValueError, match="null: cannot be written: it is not a regular file"):
         files.write_text(Path(os.devnull), "text")
 
 

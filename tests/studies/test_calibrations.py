@@ -100,7 +100,7 @@ def test_a_right_program_is_inside_all_bounds(finished):
     assert list(assessment.profile_coverage) == [0.5, 0.8]
     assert list(assessment.ranks) == RANKED
     assert {len(test.ranks) for test in assessment.ranks.values()} == {COUNT}
-    assert assessment.valley.hits == COUNT and assessment.wrong == ()
+    assert assessment.minimum.hits == COUNT and assessment.wrong == ()
     assert list(assessment.chain_coverage) == [0.5, 0.8, 0.95]
 
 
@@ -120,7 +120,7 @@ def test_wrong_profiles_and_a_wrong_posterior_are_named(made):
     ]
 
 
-def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made, experiment):
+def test_a_wrong_minimum_is_counted_whether_or_not_the_fit_says_so(made, experiment):
     fits: list[Any] = made.kept.fits[:4]
     fits[1]["cost"] += 3.5
     fits[2] |= {"cost": fits[2]["cost"] + 90.0, "converged": False}
@@ -128,14 +128,14 @@ def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made, experime
     changed = Calibration(fits, [])
     assessment = assess(changed)
     assert (assessment.wrong, assessment.wrong_but_converged) == ((2, 3), (2,))
-    assert assessment.unconverged == (3,) and assessment.valley.hits == 2
+    assert assessment.unconverged == (3,) and assessment.minimum.hits == 2
     text = document.text(calibration.document(experiment, changed, assessment))
-    assert "Replicates in another valley: 2, 3 (2 in all)." in text
-    assert "In another valley, but said to have converged: 2 (1 in all)." in text
-    assert "a valley 3.5 above the truth's" in replicates.fit_line(fits[1])
+    assert "Replicates in another minimum: 2, 3 (2 in all)." in text
+    assert "In another minimum, but said to have converged: 2 (1 in all)." in text
+    assert "a minimum 3.5 above the truth's" in replicates.fit_line(fits[1])
 
 
-def test_costs_of_valleys_are_compared_without_the_weight_of_residuals(experiment_file):
+def test_costs_of_minima_are_compared_without_the_weight_of_residuals(experiment_file):
     path = write_calibration(experiment_file.parent, "independent_every = 0.5")
     (fitted,) = calibrate(path, None, 1).fits
     assert fitted["cost"] == pytest.approx(fitted["truth_valley_cost"], abs=1e-3)
@@ -286,7 +286,7 @@ def test_a_mistake_in_a_replicate_says_in_which(experiment_file, monkeypatch):
 def test_the_folder_has_a_report(finished):
     out, printed = finished.folder, finished.printed
     assert f"{COUNT} truths of 2 parameters of record" in printed
-    assert "replicate 3: the truth's valley, 2 of 2 starts agree" in printed
+    assert "replicate 3: the truth's minimum, 2 of 2 starts agree" in printed
     everything = f"Everything is inside its bounds, but {COUNT} simulated motions prove little"
     assert everything in printed and f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()

@@ -1,4 +1,4 @@
-"""The blocks benchmark's own scoring program, which is no package."""
+"""The blocks benchmark's own scoring program, which is not a package."""
 
 import importlib.util
 from pathlib import Path

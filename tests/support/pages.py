@@ -58,7 +58,7 @@ class Page(HTMLParser):
             assert self.open.pop() == tag, f"</{tag}> closes something else"
 
     def separate(self, tag: str) -> None:
-        """Puts a space between the texts of two elements, if they are no parts of a sentence."""
+        """Puts a space between the texts of two elements, if they are not parts of a sentence."""
         if tag not in INLINE:
             self.texts.append(" ")
 

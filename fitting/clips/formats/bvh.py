@@ -51,7 +51,7 @@ def read_bvh(path: Path) -> Recording:
 
 
 def _as_number(word: str) -> float:
-    """NaN for what is no number."""
+    """NaN for what is not a number."""
     try:
         return float(word)
     except ValueError:

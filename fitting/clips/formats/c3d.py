@@ -488,7 +488,7 @@ def read_c3d(
         scale: metres per unit; None takes the unit that the file states.
 
     Raises:
-        ValueError: with the file's name, where it is no whole C3D file of markers, lacks those that
+        ValueError: with the file's name: it is not a whole C3D file of markers, lacks those that
             are named, or no frame has them all.
     """
     with error_context(path):

@@ -166,7 +166,7 @@ class Structure:
         return np.frombuffer(content, np.dtype(kind).newbyteorder(self._order))
 
     def _floats(self, content: bytes) -> Float64[np.ndarray, " values"]:
-        with np.errstate(all="ignore"):  # of values that are no numbers
+        with np.errstate(all="ignore"):  # of values that are not numbers
             if self._processor != DEC:
                 return self._array(content, "f4").astype(np.float64)
             swapped = self._array(content, "u2").reshape(-1, 2)[:, ::-1].tobytes()
@@ -271,10 +271,10 @@ def read_markers(path: Path) -> Markers:
     """The markers of a file.
 
     A marker was not seen where its residual is below 0, or where it lies exactly at the origin.
-    Angles, forces and other numbers that a model has computed are no markers.
+    Angles, forces and other numbers that a model has computed are not markers.
 
     Raises:
-        ValueError: without the file's name, where it is no whole C3D file, has no markers, no
+        ValueError: without the file's name, where it is not a whole C3D file, has no markers, no
             frames or no rate.
     """
     structure = Structure(path.read_bytes())

@@ -35,7 +35,7 @@ WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 ON_KEY = 1e-5  # s; times that are given with 32 bits are no more exact
 LATEST = 1e6  # s
 USUAL_RATE = 30.0  # Hz, of animations whose keys follow no rate
-RATES = (8.0, 1000.0)  # Hz; keys outside are no frames
+RATES = (8.0, 1000.0)  # Hz; keys outside are not frames
 ON_GRID = 0.95  # of the keys, which follow a rate
 OFF_GRID = 0.02  # of a frame; times of files are often rounded to milliseconds
 
@@ -53,7 +53,7 @@ JSON_START = 20  # bytes, in the binary form
 
 
 class Document:
-    """A glTF file. Its methods raise ValueError, without the file's name, for what is no glTF."""
+    """A glTF file. Its methods raise ValueError, without the file's name, for what is not glTF."""
 
     def __init__(self, path: Path):
         self.folder = path.parent
@@ -143,7 +143,7 @@ class Document:
             try:
                 return base64.b64decode(text if head.endswith(";base64") else "?", validate=True)
             except binascii.Error:
-                raise ValueError(f"the uri of buffer {number} is no base64") from None
+                raise ValueError(f"the uri of buffer {number} is not base64") from None
         content = buffer_path(self.folder, number, uri).read_bytes()
         self.size += len(content)
         return content
@@ -266,7 +266,7 @@ def read_curve(document: Document, sampler: Item, path: str) -> Curve:
         arriving, values, leaving = np.moveaxis(values.reshape(len(times), 3, -1), 1, 0)
         slopes = arriving, leaving
     if path == "rotation" and (np.linalg.norm(values, axis=-1) < 0.1).any():
-        raise ValueError("a rotation is no unit quaternion")
+        raise ValueError("a rotation is not a unit quaternion")
     return Curve(path, times, values, interpolation, slopes)
 
 
@@ -512,7 +512,7 @@ def _local(
             values[path] = curve.at(times)
     quats = values["rotation"]
     if (np.abs(quats).max(axis=-1) < 1e-3).any():
-        raise ValueError(f"the rotation of node {node} is no unit quaternion")
+        raise ValueError(f"the rotation of node {node} is not a unit quaternion")
     turn = Rotation.from_quat(quats)
     return values["translation"], turn.as_matrix() * values["scale"][:, None, :], turn
 

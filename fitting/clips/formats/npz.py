@@ -395,7 +395,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def check_array_file(path: Path) -> None:
-    """ValueError for an `.npy` that is no plain array, or claims to be longer than it is."""
+    """ValueError for an `.npy` that is not a plain array, or claims to be longer than it is."""
     with path.open("rb") as file:
         _check_header(file, path.name, path.stat().st_size)
 
@@ -417,14 +417,14 @@ def _check_header(file: IO[bytes], name: str, size: int) -> None:
     """ValueError for an array that says that it is longer than it is: NumPy would make room."""
     version = np.lib.format.read_magic(file)
     if version not in HEADERS:
-        raise ValueError(f"{name} is no plain array")
+        raise ValueError(f"{name} is not a plain array")
     shape, _, dtype = HEADERS[version](file)
     if (claim := math.prod(shape) * dtype.itemsize) > size:
         raise ValueError(f"{name} says {claim} bytes and has {size}")
 
 
 def array_names(path: Path) -> list[str]:
-    """The names of the arrays in an archive; none if it is no archive."""
+    """The names of the arrays in an archive; none if it is not an archive."""
     if why_unreadable(path):
         return []
     try:

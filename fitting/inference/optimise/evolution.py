@@ -1,4 +1,4 @@
-"""Evolution and sweeps, which cross the cliffs and leave the valleys where descents end.
+"""Evolution and sweeps, which cross the cliffs and leave the minima where descents end.
 
 A hard decision makes the cost jump wherever it flips, whether a threshold or a smooth parameter
 flipped it. Candidates therefore vary all parameters, each in one or more of four ways:

@@ -1,6 +1,6 @@
 """The search for the best fit: derivatives where there are some, candidates where there are none.
 
-The pipeline stays hard, and its cost has many valleys. Each start is independent of the others:
+The pipeline stays hard, and its cost has many local minima. Each start is independent of others:
 
 1. The costs of some draws from the prior are computed; the best few descend by Levenberg–Marquardt
    (`descent`), with a `sweep` of each parameter over its range in between, which frees those that a
@@ -8,8 +8,8 @@ The pipeline stays hard, and its cost has many valleys. Each start is independen
 2. Where their ends do not agree, `evolution` combines and varies them, thresholds included.
 3. The best point descends to the end (`descent.polish`).
 
-Starts are made until as many of them agree as the settings ask for: a valley that only one start
-has found may well not be the deepest. Descents of one start that agree without evolution, as starts
+Starts are made until as many of them agree as the settings ask for: a minimum that only one start
+has found may well not be the lowest. Descents of one start that agree without evolution, as starts
 have to, count as starts.
 
 A search compiles two programs, whatever the number of starts and stages: a step of
@@ -178,7 +178,7 @@ def count_agreeing(ends: Sequence[float], settings: SearchSettings) -> int:
 
 
 def agree(ends: Sequence[float], settings: SearchSettings) -> bool:
-    """Whether enough starts ended in the deepest valley: a number of them, and half of all."""
+    """Whether enough starts ended at the lowest minimum: a number of them, and half of all."""
     return count_agreeing(ends, settings) >= max(settings.agreeing_starts, len(ends) / 2)
 
 
@@ -313,9 +313,9 @@ def _message(settings: SearchSettings, end: _End) -> str:
             "of itself."
         )
     if end.state.converged and end.starts == 1:
-        return "Not converged: stopped in a valley, where the only start led."
+        return "Not converged: stopped at a local minimum, where the only start led."
     if end.state.converged:
-        return f"Not converged: stopped in a valley; {agreement}."
+        return f"Not converged: stopped at a local minimum; {agreement}."
     if end.used_up:
         return f"Not converged: the {settings.max_steps} steps allowed for a start were used up."
     return (

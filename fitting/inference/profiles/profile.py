@@ -1,9 +1,9 @@
-"""The profile of one parameter, and what it says: valleys, interval and verdict.
+"""The profile of one parameter, and what it says: minima, interval and verdict.
 
 Near its lowest point a profile is a parabola, and half a quantile of chi-square is right for how
 far it rises within an interval (1.92 for 95 %). The profile of a limit that a clip hardly reaches
-is not: beside a plateau, where the limit does nothing, a narrow valley lies where it happens to
-suit the noise of some frames. That valley is the deepest of many that noise might have made, so
+is not: beside a plateau, where the limit does nothing, a narrow minimum lies where it happens to
+suit the noise of some frames. That is the lowest of many that noise might have made, so
 chi-square excludes the plateau too often. The profile is therefore also read as a density of the
 parameter's probability, prior included, and an interval reaches as high as the smallest region with
 enough of it.
@@ -21,7 +21,7 @@ from fitting.problem.space import EDGE, FreeParameter, from_fractions, to_fracti
 
 from .conditional import Points, Targets, join
 
-BARRIER = 2.0  # times that rise, at least, lies between two valleys
+BARRIER = 2.0  # times that rise, at least, lies between two minima
 SEPARATION = 0.05  # fraction of the range, at least, likewise: hard decisions make small cliffs
 
 Verdict = Literal["two-sided", "at least", "at most", "flat", "several valleys"]
@@ -38,7 +38,7 @@ CELLS = 16  # between two points of a profile
 
 
 @dataclasses.dataclass(frozen=True)
-class Valley:
+class Minimum:
     """A part of the range in which the cost is low."""
 
     value: float
@@ -70,15 +70,15 @@ class Profile:
     """Values of all parameters at these points, in their units."""
     max_rise: float
     """Within a 95 % interval."""
-    valleys: tuple[Valley, ...]
+    minima: tuple[Minimum, ...]
     """From low values to high ones."""
     verdict: Verdict
     """Which sides the data bound."""
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 %, in the parameter's unit; from the first valley to the last."""
-        return self.valleys[0].interval[0], self.valleys[-1].interval[1]
+        """95 %, in the parameter's unit; from the first minimum to the last."""
+        return self.minima[0].interval[0], self.minima[-1].interval[1]
 
 
 def make_profile(
@@ -103,7 +103,7 @@ def make_profile(
     rises, data_rises = costs - costs.min(), data_costs - data_costs.min()
     highest = max_rise(parameter, own, rises)
     parts = low_parts(to_fractions(parameter, own), rises, highest)
-    valleys = tuple(_valley(parameter, own, rises, part, highest) for part in parts)
+    minima = tuple(_minimum(parameter, own, rises, part, highest) for part in parts)
     free_below = bool((data_rises[: parts[0].start] <= highest).all())
     free_above = bool((data_rises[parts[-1].stop :] <= highest).all())
     return Profile(
@@ -113,7 +113,7 @@ def make_profile(
         prior_rises=own_prior - own_prior.min(),
         path=path[order],
         max_rise=highest,
-        valleys=valleys,
+        minima=minima,
         verdict=_verdict(len(parts), free_below, free_above),
     )
 
@@ -121,7 +121,7 @@ def make_profile(
 def low_parts(
     places: Float[np.ndarray, " points"], rises: Float[np.ndarray, " points"], highest: float
 ) -> list[slice]:
-    """The valleys of a curve, as runs of points that rise no higher than this in between.
+    """The minima of a curve, as runs of points that rise no higher than this in between.
 
     Args:
         places: fractions of the range, rising.
@@ -153,15 +153,15 @@ def crossing(inside: tuple[float, float], outside: tuple[float, float], highest:
     return a + (b - a) * float(np.clip((np.sqrt(highest) - near) / (far - near), 0, 1))
 
 
-def _valley(
+def _minimum(
     parameter: FreeParameter, own: np.ndarray, rises: np.ndarray, part: slice, highest: float
-) -> Valley:
+) -> Minimum:
     lowest = part.start + int(np.argmin(rises[part]))
     ends = (
         _end(parameter, own, rises, (part.start, part.start - 1), highest),
         _end(parameter, own, rises, (part.stop - 1, part.stop), highest),
     )
-    return Valley(float(own[lowest]), float(rises[lowest]), ends)
+    return Minimum(float(own[lowest]), float(rises[lowest]), ends)
 
 
 def _end(
@@ -171,7 +171,7 @@ def _end(
     edge: tuple[int, int],
     highest: float,
 ) -> float:
-    """Value at which a valley ends, between its outermost point and the next.
+    """Value at which a minimum ends, between its outermost point and the next.
 
     The interval of a threshold reaches to that next point: a cliff may lie anywhere between them.
     """
@@ -185,8 +185,8 @@ def _end(
     return float(from_fractions(parameter, np.asarray(place)))
 
 
-def _verdict(valleys: int, free_below: bool, free_above: bool) -> Verdict:
-    if valleys > 1:
+def _verdict(minima: int, free_below: bool, free_above: bool) -> Verdict:
+    if minima > 1:
         return "several valleys"
     if free_below and free_above:
         return "flat"

@@ -1,7 +1,7 @@
 """Finds the profiles of all parameters at once.
 
 The whole range is scanned in batches. From the solution, each curve is then followed outwards in
-both directions as long as the data allow, and its lowest points elsewhere descend, so that valleys
+both directions as long as the data allow, and its lowest points elsewhere descend, so that minima
 are found. At last the ends of the intervals are refined. Whatever lies lower than the solution is
 kept: the best point goes back to the fit.
 """
@@ -37,17 +37,17 @@ GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractio
 FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
 FINE_GRID = (np.arange(64) + 0.5) / 64  # for plateaus of thresholds
 LOW = 40.0  # rise by the data up to which a curve is followed outwards
-PROMISING = 400.0  # and up to which a minimum of the scan may become a valley
+PROMISING = 400.0  # and up to which a minimum of the scan may become a minimum
 MINIMA = 2  # of each curve from which descents begin
 FREE_STEPS = 12  # of these descents, at most
 ROUNDS = 8  # of refinement
 SPANS = (1.0, 0.2, 0.04)  # of moves of thresholds, fractions of the range
 CROSSINGS = 8  # rounds in which cliffs are crossed, at most
-BEYOND = (0.0, 0.3, 1.0, 3.0)  # how far behind a cliff points are tried, in widths of the valley
-CLIFF = 1.5  # times the rise of a parabola: what lies behind the end of a valley may be a cliff
-NEARBY = 0.25  # widths of the valley within which it is looked for
+BEYOND = (0.0, 0.3, 1.0, 3.0)  # how far behind a cliff points are tried, in widths of the minimum
+CLIFF = 1.5  # times the rise of a parabola: what lies behind the end of a minimum may be a cliff
+NEARBY = 0.25  # widths of the minimum within which it is looked for
 NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpolated
-NARROW = 0.05  # fraction of a valley's width that its ends are found to
+NARROW = 0.05  # fraction of a minimum's width that its ends are found to
 
 
 def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> Points:
@@ -303,7 +303,7 @@ def follow_outwards(profiling: Profiling) -> None:
 
 
 def descend_elsewhere(profiling: Profiling) -> None:
-    """From the lowest minima of each curve outside the valleys, with no parameter held."""
+    """From the lowest minima of each curve outside the minima, with no parameter held."""
     curves, conditional = profiling.curves, profiling.conditional
     for i, curve in enumerate(curves.curves):
         rises = curves.data_rises(i)
@@ -320,7 +320,7 @@ def descend_elsewhere(profiling: Profiling) -> None:
 
 
 def refine(profiling: Profiling) -> None:
-    """New points where valleys end and between valleys, until the ends are known well enough."""
+    """New points where minima end and between minima, until the ends are known well enough."""
     curves, tried = profiling.curves, set()
     for number in range(ROUNDS):
         index, places, starts = [], [], []
@@ -356,7 +356,7 @@ def cross(profiling: Profiling) -> None:
 
 
 def cross_cliffs(profiling: Profiling) -> bool:
-    """Tries to go on beyond cliffs that end a valley; whether any was crossed.
+    """Tries to go on beyond cliffs that end a minimum; whether any was crossed.
 
     Behind a cliff another decision holds, so other parameters must move together with this one:
     they are drawn anew within their own intervals and a little beyond.
@@ -391,13 +391,13 @@ def cross_cliffs(profiling: Profiling) -> bool:
 
 
 def is_cliff(places: np.ndarray, rises: np.ndarray, outside: int, width: float) -> bool:
-    """Whether a curve rises much faster than a parabola outside a valley.
+    """Whether a curve rises much faster than a parabola outside a minimum.
 
     Args:
         places: fractions of the range.
-        rises: there, in units of the rise at the valley's ends.
+        rises: there, in units of the rise at the minimum's ends.
         outside: index of the first point outside.
-        width: of the valley, a fraction of the range.
+        width: of the minimum, a fraction of the range.
     """
     if not 0 <= outside < len(places):
         return False
@@ -461,7 +461,7 @@ def open_ends(curves: Curves, i: int) -> list[tuple[int, int]]:
 
 
 def barrier(curves: Curves, i: int) -> list[int]:
-    """Indices of the points between two valleys."""
+    """Indices of the points between two minima."""
     parts = low_parts(curves.fractions(i), curves.rises(i), curves.highest(i))
     return [k for a, b in zip(parts[:-1], parts[1:], strict=True) for k in range(a.stop, b.start)]
 

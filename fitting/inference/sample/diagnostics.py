@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .chain import autocorrelation_time
-from .modes import MIN_EXCHANGES, Island, log_mass, survey
+from .modes import MIN_EXCHANGES, Mode, log_mass, survey
 
 ISOLATED = 5.0  # spreads of log-probability between a walker and the others
 LAZY = 0.1  # of the median acceptance
@@ -44,7 +44,7 @@ def isolated_walkers(
     """Walkers that in the later half of the chain never come near the others' log-probability.
 
     Near is within five spreads (1.48 median absolute deviations) of the median. Such walkers sit on
-    an island of negligible weight: for a normal posterior in ten dimensions a healthy walker is
+    a mode of negligible weight: for a normal posterior in ten dimensions a healthy walker is
     that far out in one step of 2,000, and here none of half the chain's steps may be nearer.
     """
     later = log_probability[log_probability.shape[0] // 2 :]
@@ -120,7 +120,7 @@ class Check:
     isolated: Bool[np.ndarray, " walkers"]
     isolated_mass: float = 0.0
     """Estimate of the fraction of the posterior that is left out with them."""
-    islands: tuple[Island, ...] = ()
+    modes: tuple[Mode, ...] = ()
     """On which the other walkers are, in the later half; the heaviest first."""
 
     @property
@@ -138,9 +138,9 @@ class Check:
 def check(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
 ) -> Check:
-    """Isolated walkers, islands and autocorrelation times of a chain from its first step on.
+    """Isolated walkers, modes and autocorrelation times of a chain from its first step on.
 
-    Walkers whose island may have 1 % of the posterior are not isolated, however low they are.
+    Walkers whose mode may have 1 % of the posterior are not isolated, however low they are.
     """
     later = slice(len(u) // 2, None)
     isolated = isolated_walkers(log_probability)
@@ -148,8 +148,8 @@ def check(
     if mass > NEGLIGIBLE:
         isolated, mass = np.zeros_like(isolated), 0.0
     counted = u[int(START * len(u)) :, ~isolated]
-    islands = survey(u[later][:, ~isolated], log_probability[later][:, ~isolated])
-    return Check(len(u), autocorrelation_time(counted), isolated, mass, islands)
+    modes = survey(u[later][:, ~isolated], log_probability[later][:, ~isolated])
+    return Check(len(u), autocorrelation_time(counted), isolated, mass, modes)
 
 
 def _mass(
@@ -157,7 +157,7 @@ def _mass(
     log_probability: Float[np.ndarray, "steps walkers"],
     isolated: Bool[np.ndarray, " walkers"],
 ) -> float:
-    """Fraction of the posterior where isolated walkers are, each on an island of its own."""
+    """Fraction of the posterior where isolated walkers are, each in a mode of its own."""
     if not isolated.any():
         return 0.0
     rest = log_mass(u[:, ~isolated], log_probability[:, ~isolated])
@@ -215,10 +215,10 @@ def verdict(
         )
     if left_out > MAX_ISOLATED * latest.isolated.size:
         return False, f"Not converged, too many walkers are isolated: {facts}."
-    if cut_off := sum(not island.is_weighed for island in latest.islands):
+    if cut_off := sum(not mode.is_weighed for mode in latest.modes):
         return False, (
-            f"Not converged, the weights of islands are out of reach: {facts}; {cut_off} of"
-            f" {len(latest.islands)} islands have fewer than {MIN_EXCHANGES} exchanges of walkers."
+            f"Not converged, the weights of modes are out of reach: {facts}; {cut_off} of"
+            f" {len(latest.modes)} modes have fewer than {MIN_EXCHANGES} exchanges of walkers."
         )
     if lengths < stop_at:
         return False, f"Not converged, too short: {facts}; wanted {stop_at:g}."

@@ -1,8 +1,8 @@
-"""Islands: parts of a posterior that lie apart, so that small steps do not lead between them.
+"""Modes: parts of a posterior that lie apart, so that small steps do not lead between them.
 
 They are found in the draws by single linkage: two draws belong together if a chain of draws with
-small gaps leads from one to the other. Around each island stands a multivariate t distribution,
-from which jumps between islands are proposed.
+small gaps leads from one to the other. Around each mode stands a multivariate t distribution,
+from which jumps between modes are proposed.
 """
 
 import dataclasses
@@ -15,31 +15,29 @@ from jaxtyping import Float, Int
 from .chain import autocorrelation_time
 
 POINTS = 1000  # draws among which gaps are sought, at most
-GAP = 1.6  # spreads, and times the usual gap on either side, that separate islands
+GAP = 1.6  # spreads, and times the usual gap on either side, that separate modes
 USUAL = 0.9  # quantile of the gaps between neighbours that is usual
-MAX_ISLANDS = 8  # where there seem to be more, the walkers have not met yet
-SMALLEST = 0.01  # fraction of the draws of an island
-DEGREES = 5.0  # of freedom of the t distribution: tails wide enough for islands that are not normal
-MIN_EXCHANGES = 20  # of an island with the others, below which its weight is unknown
+MAX_MODES = 8  # where there seem to be more, the walkers have not met yet
+SMALLEST = 0.01  # fraction of the draws of a mode
+DEGREES = 5.0  # of freedom of the t distribution: tails wide enough for modes that are not normal
+MIN_EXCHANGES = 20  # of a mode with the others, below which its weight is unknown
 
 
 @dataclasses.dataclass(frozen=True)
-class Islands:
-    """A mixture of multivariate t distributions, one around each island."""
+class Modes:
+    """A mixture of multivariate t distributions, one around each mode."""
 
-    centres: Float[np.ndarray, "islands free"]
-    factors: Float[np.ndarray, "islands free free"]
+    centres: Float[np.ndarray, "modes free"]
+    factors: Float[np.ndarray, "modes free free"]
     """Of the scale matrices, lower triangular (Cholesky)."""
-    weights: Float[np.ndarray, " islands"]
+    weights: Float[np.ndarray, " modes"]
     """Of the mixture; not those of the posterior."""
 
     def __len__(self) -> int:
         return len(self.weights)
 
-    def log_densities(
-        self, u: Float[np.ndarray, "draws free"]
-    ) -> Float[np.ndarray, "islands draws"]:
-        """Of each island's part of the mixture, up to a constant that is the same for all."""
+    def log_densities(self, u: Float[np.ndarray, "draws free"]) -> Float[np.ndarray, "modes draws"]:
+        """Of each mode's part of the mixture, up to a constant that is the same for all."""
         free = u.shape[1]
         away = np.linalg.solve(self.factors, np.swapaxes(u[None] - self.centres[:, None], 1, 2))
         squares = np.sum(away**2, axis=1)
@@ -54,22 +52,22 @@ class Islands:
     def labels(
         self, u: Float[np.ndarray, "steps walkers free"]
     ) -> Int[np.ndarray, "steps walkers"]:
-        """The island on which each draw lies."""
+        """The mode in which each draw lies."""
         flat = u.reshape(-1, u.shape[-1])
         return np.argmax(self.log_densities(flat), axis=0).reshape(u.shape[:-1])
 
     def draw(self, random: np.random.RandomState, count: int) -> Float[np.ndarray, "draws free"]:
         """Draws of the mixture."""
-        island = random.choice(len(self), size=count, p=self.weights)
+        mode = random.choice(len(self), size=count, p=self.weights)
         normal = random.standard_normal((count, self.centres.shape[1]))
         scale = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
-        return self.centres[island] + scale[:, None] * np.einsum(
-            "nij,nj->ni", self.factors[island], normal
+        return self.centres[mode] + scale[:, None] * np.einsum(
+            "nij,nj->ni", self.factors[mode], normal
         )
 
 
-def find_islands(u: Float[np.ndarray, "steps walkers free"]) -> Islands:
-    """The islands on which these draws lie, those of fewer than 1 % of them left aside."""
+def find_modes(u: Float[np.ndarray, "steps walkers free"]) -> Modes:
+    """The modes in which these draws lie, those of fewer than 1 % of them left aside."""
     from scipy.cluster import hierarchy  # here, for it takes a while to import
 
     flat = u.reshape(-1, u.shape[-1])
@@ -79,7 +77,7 @@ def find_islands(u: Float[np.ndarray, "steps walkers free"]) -> Islands:
         return _around([points], spread)
     root: Any = hierarchy.to_tree(hierarchy.linkage(points / spread, "single"))
     apart = _split(root, max(2.0, SMALLEST * len(points)))
-    if len(apart) > MAX_ISLANDS:
+    if len(apart) > MAX_MODES:
         apart = [root]
     return _around([points[node.pre_order()] for node in apart], spread)
 
@@ -111,9 +109,9 @@ def _usual_gap(node: Any) -> float:
 
 
 def local_spread(u: Float[np.ndarray, "steps walkers free"]) -> Float[np.ndarray, " free"]:
-    """Standard deviation of each parameter within an island, roughly.
+    """Standard deviation of each parameter within a mode, roughly.
 
-    It comes from the shorter ones of the walkers' steps, which stay on their island. A step of
+    It comes from the shorter ones of the walkers' steps, which stay in their mode. A step of
     differential evolution has `2.38 / sqrt(free)` standard deviations (ter Braak 2006).
     """
     steps = np.abs(np.diff(u, axis=0)).reshape(-1, u.shape[-1])
@@ -124,10 +122,10 @@ def local_spread(u: Float[np.ndarray, "steps walkers free"]) -> Float[np.ndarray
     return np.maximum(np.quantile(moved, 0.25, axis=0) / quarter, 1e-12)
 
 
-def _around(members: list[Float[np.ndarray, "draws free"]], spread: np.ndarray) -> Islands:
-    """A t distribution around each island.
+def _around(members: list[Float[np.ndarray, "draws free"]], spread: np.ndarray) -> Modes:
+    """A t distribution around each mode.
 
-    Where an island has few draws, its covariance is drawn towards that of all islands together.
+    Where a mode has few draws, its covariance is drawn towards that of all modes together.
     """
     free = len(spread)
     centres = np.stack([points.mean(axis=0) for points in members])
@@ -139,12 +137,12 @@ def _around(members: list[Float[np.ndarray, "draws free"]], spread: np.ndarray) 
     extra = 2.0 * free
     covariances = (scatter + extra * pooled) / (counts + extra)[:, None, None]
     weights = 0.5 * (counts / counts.sum() + 1 / len(counts))
-    return Islands(centres, np.linalg.cholesky(covariances), weights)
+    return Modes(centres, np.linalg.cholesky(covariances), weights)
 
 
 @dataclasses.dataclass(frozen=True)
-class Island:
-    """An island, as a chain has visited it."""
+class Mode:
+    """A mode, as a chain has visited it."""
 
     median: Float[np.ndarray, " free"]
     """Of u there."""
@@ -167,22 +165,22 @@ class Island:
 
 def survey(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
-) -> tuple[Island, ...]:
-    """The islands on which walkers are, the heaviest first; none where there is only one."""
-    found = find_islands(u)
+) -> tuple[Mode, ...]:
+    """The modes in which walkers are, the heaviest first; none where there is only one."""
+    found = find_modes(u)
     if len(found) == 1:
         return ()
     labels = found.labels(u)
     changes = labels[1:] != labels[:-1]
-    islands = []
+    modes = []
     for label in np.unique(labels):
         there = labels == label
         exchanges = int(np.sum(changes & (there[1:] | there[:-1])))
         weight = float(there.mean())
         time = float(autocorrelation_time(there[..., None].astype(float))[0])
         error = math.sqrt(weight * (1 - weight) * time / there.size)
-        islands.append(
-            Island(
+        modes.append(
+            Mode(
                 median=np.median(u[there], axis=0),
                 weight=weight,
                 error=error if exchanges >= MIN_EXCHANGES else math.nan,
@@ -191,13 +189,13 @@ def survey(
                 log_probability=float(log_probability[there].max()),
             )
         )
-    return tuple(sorted(islands, key=lambda island: -island.weight))
+    return tuple(sorted(modes, key=lambda mode: -mode.weight))
 
 
 def log_mass(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
 ) -> float:
-    """Logarithm of the integral of the density over an island, if that is normal.
+    """Logarithm of the integral of the density over a mode, if that is normal.
 
     The integral's logarithm is the mean of the log-density plus the entropy, which for a normal
     follows from the covariance. Minus infinity where walkers never move.

@@ -21,7 +21,7 @@ from fitting.runtime.precision import in_float64
 from . import diagnostics
 from .blocks import DEFAULTS, BlockLogLikelihood, SamplerSettings
 from .chain import Chain, Identity
-from .modes import Island
+from .modes import Mode
 
 if TYPE_CHECKING:
     import pandas
@@ -64,7 +64,7 @@ class WalkerStart:
     sd: Float[Array | np.ndarray, " _"]
     """Of u."""
     elsewhere: Float[Array | np.ndarray, "places _"] | None = None
-    """Other u around which a quarter of the walkers starts, so that islands there are found."""
+    """Other u around which a quarter of the walkers starts, so that modes there are found."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Posterior(Shown):
     acceptance: Float[np.ndarray, " walkers"]
     """Fraction of the stored steps' proposals."""
     isolated: list[int]
-    """Walkers that never come near the others, on islands of negligible weight; left out of the
+    """Walkers that never come near the others, in modes of negligible weight; left out of the
     summary."""
     stuck: list[int]
     """Those, and walkers that hardly ever move."""
@@ -98,7 +98,7 @@ class Posterior(Shown):
     """Estimate of the fraction of the posterior where the isolated walkers are."""
     sigmas: Mapping[str, Float[np.ndarray, " draws"]] = dataclasses.field(default_factory=dict)
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
-    islands: tuple[Island, ...] = ()
+    modes: tuple[Mode, ...] = ()
     """The heaviest first; none where there is only one."""
     minus_costs: Float[np.ndarray, "steps walkers"] | None = None
     """By which the fit compares points: as the log-probability, with the prior weighted, too."""
@@ -339,5 +339,5 @@ def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float
         message=outcome.message,
         seconds=seconds,
         interrupted=outcome.interrupted,
-        islands=check.islands,
+        modes=check.modes,
     )

@@ -1,7 +1,7 @@
 """Steps of emcee through the hard program.
 
 The moves are differential evolution at its usual scale (ter Braak 2006), and jumps, which lead from
-one island of the posterior to another. Never emcee 3.1.6's snooker move: its acceptance is wrong,
+one mode of the posterior to another. Never emcee 3.1.6's snooker move: its acceptance is wrong,
 and in 20 dimensions it shrinks a unit variance to 0.81.
 """
 
@@ -21,7 +21,7 @@ from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
 from .chain import Chain, Identity, LastStep, RandomState
-from .modes import Islands, find_islands
+from .modes import Modes, find_modes
 
 # Fraction of the steps. Effective samples per 1,000 evaluations of the slowest parameter, with 0,
 # 0.2 and 0.5: 39, 96 and 210 for the 6 smooth ones of data/experiments/ozz.toml, 3, 18 and 14 for
@@ -33,10 +33,10 @@ FIRST_LESSON = 100  # steps before the first jump
 
 
 class JumpMove(emcee.moves.MHMove):
-    """Proposals around all islands that the later half of a chain shows, wherever a walker is.
+    """Proposals around all modes that the later half of a chain shows, wherever a walker is.
 
     Differential evolution moves a walker by the difference of two others, which seldom leads from
-    an island to a place on another one that is as good. Jumps are independent of the walker
+    a mode to a place on another one that is as good. Jumps are independent of the walker
     (Tierney 1994, section 2.3.3). They are learnt anew whenever the chain is twice as long, so that
     they settle (Chimisov, Latuszynski and Roberts, Air Markov chain Monte Carlo, 2018), and follow
     from the chain alone: a resumed chain makes the same.
@@ -46,7 +46,7 @@ class JumpMove(emcee.moves.MHMove):
         super().__init__(self._proposals)
         self._chain = chain
         self._learnt_from = 0  # stored steps
-        self._islands: Islands | None = None
+        self._modes: Modes | None = None
         self._before = emcee.moves.DEMove(gamma0=1.0)
 
     def propose(self, model, state):
@@ -56,16 +56,16 @@ class JumpMove(emcee.moves.MHMove):
             return self._before.propose(model, state)
         if length != self._learnt_from:
             self._learnt_from = length
-            self._islands = find_islands(self._chain.u[length // 2 : length])
+            self._modes = find_modes(self._chain.u[length // 2 : length])
         return super().propose(model, state)
 
     def _proposals(
         self, u: np.ndarray, random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
         """New positions, and the log-ratios of their densities."""
-        assert self._islands is not None
-        proposed = self._islands.draw(random, len(u))
-        return proposed, self._islands.log_density(u) - self._islands.log_density(proposed)
+        assert self._modes is not None
+        proposed = self._modes.draw(random, len(u))
+        return proposed, self._modes.log_density(u) - self._modes.log_density(proposed)
 
 
 def lesson(stored: int, thin_by: int) -> int:

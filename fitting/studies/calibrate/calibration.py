@@ -38,7 +38,7 @@ from .replicates import (
     DRAWS,
     LEVELS,
     LOG_PROBABILITY,
-    SAME_VALLEY,
+    SAME_MINIMUM,
     WRITER,
     Judgement,
     Kind,
@@ -61,7 +61,7 @@ CHAINS = Kind("chains", "chains", JsonFile(ReplicateChain, WRITER, ADVICE), chai
 
 FAMILY_LEVEL = 0.95  # of all checks together
 FIT_LEVEL = 0.95  # of the fit's intervals
-IN_VALLEY = 0.98  # of the fits, at least
+IN_MINIMUM = 0.98  # of the fits, at least
 NEAR = 0.05  # of its range: a parameter that is so near its truth has come back
 
 NUMBERS, SUMMARY = "calibration.json", "summary.md"
@@ -108,13 +108,13 @@ class Assessment(Judgement):
     """The same, by parameter."""
     profile_coverage: Mapping[float, Proportion]
     """How often narrower intervals do, by level, that the profiles of smooth parameters give."""
-    valley: Proportion
-    """How often the fit ended in the truth's valley, or a deeper one."""
+    minimum: Proportion
+    """How often the fit ended in the truth's minimum, or a lower one."""
     recovery: Proportion
     """How often a parameter that was called determined came back."""
     recovery_of: Mapping[str, Proportion]
     wrong: tuple[int, ...]
-    """Replicates that ended in another valley, from 1."""
+    """Replicates that ended in another minimum, from 1."""
     wrong_but_converged: tuple[int, ...]
     """Those of them that say that they converged."""
     unconverged: tuple[int, ...]
@@ -138,7 +138,7 @@ class Assessment(Judgement):
                 f"the {percent(level, 0)} intervals of profiles": cover
                 for level, cover in self.profile_coverage.items()
             },
-            "the share of fits in the right valley": self.valley,
+            "the share of fits in the right minimum": self.minimum,
             **{
                 f"{posterior} {percent(level, 0)} intervals": cover
                 for level, cover in self.chain_coverage.items()
@@ -235,7 +235,7 @@ def assess(calibration: Calibration) -> Assessment:
     intervals = _of_parameters(fits, "interval")
     covered = (intervals[..., 0] <= truth) & (truth <= intervals[..., 1])
     gaps = np.asarray([fitted["cost"] - fitted["truth_valley_cost"] for fitted in fits])
-    right = gaps <= SAME_VALLEY
+    right = gaps <= SAME_MINIMUM
     converged = np.asarray([fitted["converged"] for fitted in fits])
     determined = _of_parameters(fits, "determined")
     width = _of_parameters(fits, "high") - _of_parameters(fits, "low")
@@ -256,7 +256,7 @@ def assess(calibration: Calibration) -> Assessment:
         profile_coverage={
             nominal: share(levels <= nominal, wanted=(nominal, nominal)) for nominal in inner
         },
-        valley=share(right[:, None], wanted=(IN_VALLEY, 1.0)),
+        minimum=share(right[:, None], wanted=(IN_MINIMUM, 1.0)),
         recovery=share(near, determined),
         recovery_of={name: share(near[:, [i]], determined[:, [i]]) for i, name in enumerate(names)},
         wrong=numbers(~right),
@@ -352,11 +352,10 @@ def document(experiment: Experiment, calibration: Calibration, assessment: Asses
 def remarks(assessment: Assessment) -> list[str]:
     """What the tables do not say, a sentence each; nothing if there is nothing to say."""
     sentences = {
-        f"A fit is in the right valley if its cost is at most {SAME_VALLEY:g} above where a descent"
-        f" from the truth ends; {percent(IN_VALLEY, 0)} should be. Replicates in another valley": (
-            assessment.wrong
-        ),
-        "In another valley, but said to have converged": assessment.wrong_but_converged,
+        f"A fit is in the right minimum if its cost is at most {SAME_MINIMUM:g} above where a "
+        f"descent from the truth ends; {percent(IN_MINIMUM, 0)} should be. Replicates in another "
+        "minimum": (assessment.wrong),
+        "In another minimum, but said to have converged": assessment.wrong_but_converged,
         "Fits that did not converge": assessment.unconverged,
         f"Chains that did not converge, or have fewer than {DRAWS} independent draws": (
             assessment.short_chains
@@ -389,8 +388,8 @@ def checks_table(assessment: Assessment) -> Table:
         claimed = percent(level, 0)
         words = f"the posterior's {claimed} intervals contain the truth"
         table.append(share_row(words, cover, claimed))
-    valley = f"{percent(IN_VALLEY, 0)} or more"
-    table.append(share_row("fits in the right valley", assessment.valley, valley))
+    minimum = f"{percent(IN_MINIMUM, 0)} or more"
+    table.append(share_row("fits in the right minimum", assessment.minimum, minimum))
     back = "determined parameters came back"
     table.append([*share_row(back, assessment.recovery, "")[:-1], ""])
     return table
@@ -517,8 +516,8 @@ def _recovered(axes: Axes, fits: Sequence[ReplicateFit], i: int) -> None:
 
 
 def findings(assessment: Assessment) -> list[Finding]:
-    """Whether intervals are true, whether fits find the right valley, and what comes back."""
-    return [_intervals(assessment), _valleys(assessment), _recovery(assessment)]
+    """Whether intervals are true, whether fits find the right minimum, and what comes back."""
+    return [_intervals(assessment), _minima(assessment), _recovery(assessment)]
 
 
 def _intervals(assessment: Assessment) -> Finding:
@@ -541,9 +540,9 @@ def _intervals(assessment: Assessment) -> Finding:
     return Finding(f"On {motions} everything is inside its bounds: {coverage}.")
 
 
-def _valleys(assessment: Assessment) -> Finding:
-    valley = assessment.valley
-    text = f"{valley.hits} of {valley.total} fits end where a descent from the truth does"
+def _minima(assessment: Assessment) -> Finding:
+    minimum = assessment.minimum
+    text = f"{minimum.hits} of {minimum.total} fits end where a descent from the truth does"
     wrong, unconverged = len(assessment.wrong_but_converged), len(assessment.unconverged)
     short = len(assessment.short_chains)
     faults = [

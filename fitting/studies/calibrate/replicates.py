@@ -57,7 +57,7 @@ IDENTITY = "identity.json"
 WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
 PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
 Result = TypeVar("Result", bound=Mapping[str, Any])
-SAME_VALLEY = 3.0  # of cost, above the lowest that a descent from the truth reaches
+SAME_MINIMUM = 3.0  # of cost, above the lowest that a descent from the truth reaches
 
 
 class Identity(TypedDict):
@@ -333,7 +333,7 @@ def fit_simulated(
 def fit_line(fitted: ReplicateFit) -> str:
     """A finished fit in one line, for the terminal."""
     gap = fitted["cost"] - fitted["truth_valley_cost"]
-    end = "the truth's valley" if gap <= SAME_VALLEY else f"a valley {gap:.1f} above the truth's"
+    end = "the truth's minimum" if gap <= SAME_MINIMUM else f"a minimum {gap:.1f} above the truth's"
     return (
         f"replicate {fitted['number'] + 1}: {end}, {fitted['agreeing']} of {fitted['starts']} "
         f"starts agree{'' if fitted['converged'] else ', not converged'}; {fitted['seconds']:.1f} s"

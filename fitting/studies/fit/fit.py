@@ -165,7 +165,7 @@ def summarise_priors(space: Space) -> dict[str, PriorSummary]:
     }
 
 
-class FittedValley(TypedDict):
+class FittedMinimum(TypedDict):
     """A part of a parameter's range in which the cost is low."""
 
     value: Finite
@@ -198,7 +198,7 @@ class FittedParameter(TypedDict):
     """95 %."""
     verdict: profile.Verdict
     """Which sides the clips bound."""
-    valleys: list[FittedValley]
+    valleys: list[FittedMinimum]
     """From low values to high ones; one unless the verdict says several."""
     contraction: float
     """0 where only the prior is known, 1 where the clips decide."""
@@ -462,7 +462,7 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
                     "interval": list(v.interval),
                     "values": curve.path[np.argmin(np.abs(curve.values - v.value))].tolist(),
                 }
-                for v in curve.valleys
+                for v in curve.minima
             ],
             "contraction": float(known.contraction[i]),
             "at_bound": known.at_bound[i],

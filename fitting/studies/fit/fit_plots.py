@@ -417,9 +417,9 @@ def _draw(axes: Axes, parameter: FreeParameter, curve: Profile, true: float | No
     places = to_fractions(parameter, curve.values)
     axes.plot(places, curve.rises, ".-", color=AFTER, markersize=4)
     axes.plot(places, curve.prior_rises, "--", color=BEFORE)
-    for valley in curve.valleys:
+    for minimum in curve.minima:
         axes.axvspan(
-            *to_fractions(parameter, np.asarray(valley.interval)),
+            *to_fractions(parameter, np.asarray(minimum.interval)),
             color=AFTER, alpha=0.18, linewidth=0,
         )  # fmt: skip
     axes.axhline(curve.max_rise, color="black", linestyle=":", linewidth=1.2)

@@ -68,7 +68,7 @@ def verdict(row: FittedParameter) -> str:
         case "at most":
             return f"at most {number(high)}{unit}"
         case "several valleys":
-            return f"{len(row['valleys'])} valleys"
+            return f"{len(row['valleys'])} local minima"
         case _:
             return "determined" if row["determined"] else "undetermined by these clips"
 

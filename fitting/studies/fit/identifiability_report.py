@@ -18,7 +18,7 @@ from .fit_tables import verdict
 DETERMINED = (
     "A parameter is held at each value of its range while all others follow; the 95 % interval is "
     "where the cost stays low ([curves](profiles.png)). Determined: both ends of the interval are "
-    "set by the clips, in one valley, and it is less than 0.7 times as wide as the prior's. "
+    "set by the clips, at one local minimum, and it is less than 0.7 times as wide as the prior's. "
     "Contraction is 1 where the clips alone decide and 0 where only the prior is known."
 )
 
@@ -71,15 +71,15 @@ def determined_blocks(fitted: Fit, clips: int) -> list[Block]:
 
 def verdict_table(rows: Sequence[FittedParameter]) -> Table:
     """Free parameters by how well the clips determine them, the worst first."""
-    table = [["parameter", "kind", "verdict", "95 % interval", "contraction", "valleys"]]
+    table = [["parameter", "kind", "verdict", "95 % interval", "contraction", "local minima"]]
     for row in sorted(rows, key=lambda row: row["contraction"]):
-        valleys = [
-            f"{interval(*valley['interval'])}, lowest at {number(valley['value'])}"
-            f" ({valley['rise']:+.1f})"
-            for valley in row["valleys"]
+        minima = [
+            f"{interval(*minimum['interval'])}, lowest at {number(minimum['value'])}"
+            f" ({minimum['rise']:+.1f})"
+            for minimum in row["valleys"]
         ]
         cells = [row["name"], row["kind"], verdict(row), interval(*row["interval"])]
-        several = "; ".join(valleys) if len(valleys) > 1 else ""
+        several = "; ".join(minima) if len(minima) > 1 else ""
         table.append([*cells, f"{row['contraction']:.3f}", several])
     return table
 

@@ -205,11 +205,11 @@ def _check_numbers(summary: FitRecord) -> None:
     if len(set(names)) < len(names):
         raise ValueError(f"its parameters are {names}; wanted each once")
     for row in rows:
-        for valley in row.get("valleys", ()):
-            if len(valley.get("values", rows)) != len(rows):
+        for minimum in row.get("valleys", ()):
+            if len(minimum.get("values", rows)) != len(rows):
                 raise ValueError(
-                    f"a valley of {row['name']} has {len(valley.get('values', ()))} values; wanted "
-                    f"{len(rows)}, one of each parameter"
+                    f"a minimum of {row['name']} has {len(minimum.get('values', ()))} values; "
+                    f"wanted {len(rows)}, one of each parameter"
                 )
 
 
@@ -247,13 +247,13 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "left_out": {"walkers": posterior.isolated, "weight": posterior.isolated_mass},
         "islands": [
             {
-                "weight": island.weight,
-                "error": island.error if island.is_weighed else None,
-                "exchanges": island.exchanges,
-                "walkers": island.walkers,
-                "log_probability": island.log_probability,
+                "weight": mode.weight,
+                "error": mode.error if mode.is_weighed else None,
+                "exchanges": mode.exchanges,
+                "walkers": mode.walkers,
+                "log_probability": mode.log_probability,
             }
-            for island in posterior.islands
+            for mode in posterior.modes
         ],
         "seconds": posterior.seconds,
         "lower_point": lower if sampled.has_lower_point else None,

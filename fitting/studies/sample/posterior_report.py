@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
 from fitting.inference.sample.diagnostics import ParameterSummary
-from fitting.inference.sample.modes import MIN_EXCHANGES, Island
+from fitting.inference.sample.modes import MIN_EXCHANGES, Mode
 from fitting.inference.sample.posterior import Posterior
 from fitting.inference.sample.prior_sensitivity import MAX_K, Reweighted
 from fitting.problem.space import Space
@@ -117,7 +117,7 @@ def sections(sampled: SampledFit, run: Path | None) -> list[Section]:
                 brief=True,
             )
         )
-    blocks += island_blocks(posterior, sampled.space, units)
+    blocks += mode_blocks(posterior, sampled.space, units)
     blocks += posterior_prior_blocks(sampled, units)
     plots = [
         Plot(
@@ -154,7 +154,7 @@ def _health(posterior: Posterior) -> list[str]:
         f"Mean acceptance {percent(float(posterior.acceptance.mean()))}; slowest "
         f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
         f"Stuck walkers: {stuck}.",
-        *island_sentences(posterior),
+        *mode_sentences(posterior),
     ]
 
 
@@ -261,12 +261,12 @@ def _describe(found: Disagreement) -> str:
     )
 
 
-def island_sentences(posterior: Posterior) -> list[str]:
-    """How many islands there are, what they weigh, and which walkers were left out and why."""
+def mode_sentences(posterior: Posterior) -> list[str]:
+    """How many modes there are, what they weigh, and which walkers were left out and why."""
     sentences = []
-    if posterior.islands:
-        weights = ", ".join(_weight(island) for island in posterior.islands)
-        sentences.append(f"The posterior has {len(posterior.islands)} islands: {weights}.")
+    if posterior.modes:
+        weights = ", ".join(_weight(mode) for mode in posterior.modes)
+        sentences.append(f"The posterior has {len(posterior.modes)} modes: {weights}.")
     if posterior.isolated:
         walkers = ", ".join(map(str, posterior.isolated))
         sentences.append(
@@ -277,47 +277,47 @@ def island_sentences(posterior: Posterior) -> list[str]:
     return sentences
 
 
-def island_blocks(posterior: Posterior, space: Space, units: Mapping[str, str]) -> list[Block]:
-    """Islands and their medians; nothing where there is one island only."""
-    islands = posterior.islands
-    if not islands:
+def mode_blocks(posterior: Posterior, space: Space, units: Mapping[str, str]) -> list[Block]:
+    """Modes and their medians; nothing where there is one mode only."""
+    modes = posterior.modes
+    if not modes:
         return []
     blocks: list[Block] = [
-        Heading("Islands"),
+        Heading("Modes"),
         Text(
             "Parts of the posterior that lie apart. Walkers come and go between them by jumps, so "
             "that each weighs as many draws as it deserves; exchanges count how often one came or "
             "left."
         ),
-        Grid(island_table(islands), "Islands", brief=False),
-        Text("Medians on each island:"),
-        Grid(median_table(islands, space, units), "Medians on each island", brief=False),
+        Grid(mode_table(modes), "Modes", brief=False),
+        Text("Medians in each mode:"),
+        Grid(median_table(modes, space, units), "Medians in each mode", brief=False),
     ]
-    if not all(island.is_weighed for island in islands):
+    if not all(mode.is_weighed for mode in modes):
         blocks.append(
             Text(
                 f"Where there were fewer than {MIN_EXCHANGES} exchanges, the weight is out of "
                 "reach: there are as many draws as walkers happened to start there, and intervals "
-                "over all islands are no better. Sample longer, or narrow a prior to the island "
+                "over all modes are no better. Sample longer, or narrow a prior to the mode "
                 "that is meant."
             )
         )
     return blocks
 
 
-def island_table(islands: tuple[Island, ...]) -> Table:
-    """Weight, exchanges and height of each island."""
-    table = [["island", "weight", "exchanges", "walkers at the end", "highest log-probability"]]
-    for index, island in enumerate(islands, 1):
-        counts = map(str, (island.exchanges, island.walkers))
-        table.append([str(index), _weight(island), *counts, number(island.log_probability)])
+def mode_table(modes: tuple[Mode, ...]) -> Table:
+    """Weight, exchanges and height of each mode."""
+    table = [["mode", "weight", "exchanges", "walkers at the end", "highest log-probability"]]
+    for index, mode in enumerate(modes, 1):
+        counts = map(str, (mode.exchanges, mode.walkers))
+        table.append([str(index), _weight(mode), *counts, number(mode.log_probability)])
     return table
 
 
-def median_table(islands: tuple[Island, ...], space: Space, units: Mapping[str, str]) -> Table:
-    """Median of each parameter on each island."""
-    values = np.asarray(space.values(np.stack([island.median for island in islands])))
-    heading = [f"island {index}" for index in range(1, len(islands) + 1)]
+def median_table(modes: tuple[Mode, ...], space: Space, units: Mapping[str, str]) -> Table:
+    """Median of each parameter in each mode."""
+    values = np.asarray(space.values(np.stack([mode.median for mode in modes])))
+    heading = [f"mode {index}" for index in range(1, len(modes) + 1)]
     rows = zip(space.names, values.T, strict=True)
     return [
         ["parameter", "unit", *heading],
@@ -325,10 +325,10 @@ def median_table(islands: tuple[Island, ...], space: Space, units: Mapping[str, 
     ]
 
 
-def _weight(island: Island) -> str:
-    if math.isnan(island.error):
-        return f"out of reach ({percent(island.weight)} of the draws)"
-    return f"{percent(island.weight)} ± {percent(island.error)}"
+def _weight(mode: Mode) -> str:
+    if math.isnan(mode.error):
+        return f"out of reach ({percent(mode.weight)} of the draws)"
+    return f"{percent(mode.weight)} ± {percent(mode.error)}"
 
 
 def left_out_sentence(found: LeaveOneOut) -> str:

@@ -109,14 +109,14 @@ def sample_around(
 
 
 def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerStart:
-    """Around the fit, and around the other valleys that profiles have met."""
+    """Around the fit, and around the other minima that profiles have met."""
     u = np.array([row["u"] for row in parameters])
     sd = np.array([row["start_sd"] for row in parameters])
     known = [u]
-    valleys = [valley for row in parameters for valley in row.get("valleys", ())]
-    for valley in sorted(valleys, key=lambda valley: valley["rise"]):
-        if "values" in valley:
-            place = np.asarray(space.pack(dict(zip(space.names, valley["values"], strict=True))))
+    minima = [minimum for row in parameters for minimum in row.get("valleys", ())]
+    for minimum in sorted(minima, key=lambda minimum: minimum["rise"]):
+        if "values" in minimum:
+            place = np.asarray(space.pack(dict(zip(space.names, minimum["values"], strict=True))))
             if all(np.max(np.abs(place - other) / sd) > APART for other in known):
                 known.append(place)
     return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))

@@ -55,7 +55,7 @@ def accepted(footing: Footing, hit: Hit) -> float:
     if not hit.found:
         return 0.0
     step = float(hit.point @ footing.up)
-    # A plane through the root is no step, however high it is at the foot.
+    # A plane through the root is not a step, however high it is at the foot.
     sloped = -float(across(hit.point, footing.up) @ hit.normal) / float(hit.normal @ footing.up)
     if step * sloped > 0.0:
         step = math.copysign(max(abs(step) - abs(sloped), 0.0), step)
