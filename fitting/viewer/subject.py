@@ -132,7 +132,7 @@ def subject_of_fit(
                 clip.base,
                 scene.terrain,
                 root=clip.root,
-                tracks=scene.tracks,
+                tracks={name: np.asarray(track) for name, track in scene.tracks.items()},
                 given_frames=scene.frames,
                 captured=with_soles_of(clip.reference, clip.base),
             ),
