@@ -157,7 +157,7 @@ def test_whatever_changes_a_program_changes_its_key_sources_and_versions_too(mon
 
     monkeypatch.setattr(closure, "__module__", "fitting.somewhere")
     for function in (key, local(), closure):  # of a user, and what its source does not tell
-        with pytest.raises(NotPlainError, match="no named function of this project"):
+        with pytest.raises(NotPlainError, match="not a named function of this project"):
             program_cache.program_key(function, ((), {}))
     before, both = key(1), program_cache.sources()
     for part, changed in {"versions": {"jax": "1.2.3"}, "sources": "changed"}.items():
