@@ -9,9 +9,6 @@ references.
 import dataclasses
 import math
 
-import jax.numpy as jnp
-from jaxtyping import Array
-
 from jaxik.pipeline import FootIK
 from jaxik.stages.contact import (
     HeightContact,
@@ -45,13 +42,6 @@ from jaxik.world.skeleton import Rig
 SLOPES = {"max_pitch": 0.8, "min_pitch": -1.0, "max_roll": 0.45, "min_roll": -0.6}
 """Limits of feet, rad, within which soles lie on slopes of 25 degrees."""
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
-
-
-def _pitch(rig: Rig | None, of_people: float) -> Array | float:
-    """How far a body pitches with the slope: that of four legs and more lies along it."""
-    if rig is None:
-        return of_people
-    return jnp.where(jnp.sum(rig.present, axis=-1) > 3, 1.0, of_people)
 
 
 def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
@@ -94,7 +84,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 spring=True,
                 follow_slopes=True,
             ),
-            lean=SlopeLean(forward_rate=_pitch(rig, -0.30)),
+            lean=SlopeLean(forward_rate=body.pitch_rate(rig, -0.30)),
             lock=OffsetLock(
                 hold_ball=True,
                 release_max_angle=math.pi,
@@ -243,7 +233,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         ),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),
-        lean=SpineLean(pelvis_rate=_pitch(rig, -0.25)),
+        lean=SpineLean(pelvis_rate=body.pitch_rate(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
         pelvis=ReachPelvis(rise_half_life=0.03, fall_half_life=0.03, spring=True),

@@ -55,6 +55,13 @@ class Size(NamedTuple):
     """Ratio of the foot's length to the adult's."""
 
 
+def pitch_rate(rig: Rig | None, of_people: float) -> Array | float:
+    """How far a body pitches with a slope: that of four legs and more lies along it."""
+    if rig is None:
+        return of_people
+    return jnp.where(jnp.sum(rig.present, axis=-1) > 3, 1.0, of_people)
+
+
 def scale(system: Tree, rig: Rig | None) -> Tree:
     """A system for the adult, with every number as this body needs it.
 
