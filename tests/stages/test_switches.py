@@ -146,7 +146,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.by_height", (False, True), "+ target height", LOW, UNSTABLE),
         WALKS("probe.by_speed", (False, True), "+ target height", LOW, FIXED | LOW_SPEED),
         Case("probe.layers", (NONE, ALL), "+ target height", RAISED),
-        Case("probe.foot_length", (0.25, 0.35), "+ pitch", KINK),
+        Case("probe.foot_length", (0.22, 0.28), "+ pitch", KINK),
         Case("probe.half_width", (0.04, 0.06), "- roll", RIGHT_KINK),
         Case("target.foot_height", (0.08, 0.12), "+ target height"),
         DRIFTS("lock.plant", (False, True), "- slip"),
