@@ -106,4 +106,5 @@ def test_the_lowest_version_of_jax_is_the_one_on_which_all_tests_run_and_there_i
     lines = (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8").split()
     pinned = dict(line.split("==") for line in lines)
     wanted = {f"{name}>={pinned[name]}" for name in ("jax", "equinox", "optimistix", "lineax")}
-    assert wanted <= set(project["dependencies"])
+    extra = project["optional-dependencies"]["fit"]
+    assert wanted <= {*project["dependencies"], *extra}

@@ -70,6 +70,7 @@ SPINE = SpineLean(**LEAN)
 def leans(rule, points, normals, rots, weights, slides, gate=HARD):
     """Rotations of trunk, head and pelvis (frames, 4), world axes."""
     terrain = fragment(Terrain, up_ws=jnp.asarray([0.0, 1.0, 0.0], normals.dtype))
+    rig = fragment(Rig, side=jnp.zeros(2, normals.dtype), present=jnp.ones(2, bool))
 
     def frame(carry, inputs):
         state, started = carry
@@ -77,7 +78,7 @@ def leans(rule, points, normals, rots, weights, slides, gate=HARD):
         root = fragment(Frame, world_from_model=Transform(jnp.zeros(3, rot.dtype), rot))
         hits = fragment(Hit, found=jnp.ones_like(weight), point=point, normal=normal)
         slope = rule.sense(
-            fragment(Inputs, frame=root, terrain=terrain),
+            fragment(Inputs, rig=rig, frame=root, terrain=terrain),
             fragment(GroundHits, ankle=hits),
             fragment(Contact, weight=weight),
             jnp.ones_like(weight),
@@ -88,7 +89,6 @@ def leans(rule, points, normals, rots, weights, slides, gate=HARD):
         trunk = quat.multiply(lean.spine_ws, lean.rot_ws)
         return (state, jnp.ones_like(started)), (trunk, lean.head_ws, lean.rot_ws)
 
-    rig = fragment(Rig, side=jnp.zeros(2, normals.dtype))
     start = rule.init(rig), jnp.zeros((), bool)
     return jax.lax.scan(frame, start, (rots, points, normals, weights, slides))[1]
 
