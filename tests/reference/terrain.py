@@ -18,7 +18,7 @@ SLACK = 1e-12  # barycentric: a ray through a shared edge hits at least one of i
 class Hit(NamedTuple):
     """What a ray hit. For a miss: the end of the ray (its start if infinite) and up as normal."""
 
-    found: bool
+    found: float
     point: Array
     normal: Array
     platform: int = -1

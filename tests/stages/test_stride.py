@@ -111,10 +111,12 @@ FINE = np.linspace(0.0, 1.0, 801)
     [(STEP_UP, 0.25, 0.25), (STEP_DOWN, 0.0, 0.25), (HURDLE, 0.0, 0.2)],
     ids=["up", "down", "over a hurdle"],
 )
-def test_the_ground_of_a_swing_does_not_jump_and_leads_to_the_next_foothold(ground, end, highest):
+def test_the_ground_of_a_swing_is_one_arc_that_leads_to_the_next_foothold(ground, end, highest):
     height = heights(ground, swing(FINE))
     assert height[-1] == pytest.approx(end, abs=1e-12)
-    assert 0.1 < height.max() <= highest + 1e-12
+    assert 0.1 < height.max() <= highest + 0.06
+    top = np.argmax(height)
+    assert (np.diff(height[: top + 1]) >= 0).all() and (np.diff(height[top:]) <= 0).all()
     coarse, fine = (np.abs(np.diff(height[::step])).max() for step in (8, 1))
     assert coarse < 0.02 and fine < coarse / 6, "at a jump both would be equally large"
 
@@ -141,7 +143,7 @@ def test_stairs_are_climbed_that_are_as_high_as_a_ledge_that_is_refused():
     frames = swing(FINE, following=1.4)
     path = 0.5 * frames.world_from_model.pos[:, 2]  # the game has the root on the stairs
     frames = frames.translated(path[:, None] * np.array([0.0, 1.0, 0.0]))
-    # Both footholds lie in the middle of a tread.
+    # The last foothold lies in the middle of a tread, the next one is moved there.
     treads = [(0.3 * n - 0.15, 0.3 * n + 0.15, 0.15 * n) for n in range(1, 6)]
     climbed = heights(level_blocks((-3.0, 0.15, 0.0), *treads), frames)
     assert climbed[-1] == pytest.approx(0.75, abs=1e-12)
@@ -215,33 +217,49 @@ def test_toes_may_hang_over_an_edge():
     slide, support, height = slides(DROP_AHEAD)
     on_top = (PLACES < 0) & (height > -0.1)
     assert (slide[on_top] == 0).all()
-    assert_close([support[on_top].min(), support[on_top].max()], [5 / 6, 1.0], 1e-9)
+    assert_close([support[on_top].min(), support[on_top].max()], [9 / 11, 1.0], 1e-9)
 
 
-@pytest.mark.parametrize("ground", [DROP_BEHIND, WALL_BEHIND], ids=["over a drop", "in a wall"])
-def test_a_heel_without_support_slides_onto_the_block_of_its_ball(ground):
-    slide, support, height = slides(ground)
+def test_a_heel_over_a_drop_slides_onto_the_block_of_its_ball():
+    slide, support, height = slides(DROP_BEHIND)
     on_block = (PLACES > 0.005) & (np.abs(height) < 0.1)
-    pose = at(standing().pose, (0, 0))
-    length = HEEL + float(pose.toe.pos[2] - pose.ankle.pos[2]) + TOE
     # Shares of the sole on ground ahead of 0 m.
-    before, after = (np.clip((x + TOE) / length, 0.0, 1.0) for x in (PLACES, PLACES + slide))
-    assert (slide[on_block & (before > 0.85)] == 0).all()
+    before, after = (np.clip((x + TOE) / sole(), 0.0, 1.0) for x in (PLACES, PLACES + slide))
+    assert (slide[on_block & (before > 0.65)] == 0).all()
     lacking = on_block & (before < 0.4)
-    assert lacking.sum() > 20 and (slide[lacking] > 0.04).all()
+    assert lacking.sum() > 10 and (slide[lacking] > 0.04).all()
     assert (after[lacking] > before[lacking] + 0.1).all()
-    # Points lie along the sole in fifths, so that the shares of both differ by a point at most.
-    assert np.abs(support - after)[on_block].max() < 0.25
+    # Points lie along the sole in tenths, so that the shares of both differ by a point at most.
+    assert np.abs(support - after)[on_block].max() < 0.12
+
+
+def test_a_heel_in_a_wall_slides_out_of_it_or_the_ball_onto_it():
+    slide, support, height = slides(WALL_BEHIND)
+    near, ball = np.abs(PLACES - 0.05) < 0.2, PLACES + slide
+    assert support[near].min() > 0.8
+    on_top = height > 0.2
+    assert 0.3 < on_top[near].mean() < 0.8 and ball[near & on_top].max() <= 0.0
+    heel = ball + TOE - sole()
+    assert heel[near & ~on_top].min() > -0.1 * sole()
+    # The foot goes to the nearer of both places: only between them it moves by more than a point.
+    moved = np.abs(np.diff(ball[near]))
+    assert (moved > 0.11 * sole()).sum() == 1
+
+
+def sole() -> float:
+    """Length of a sole, m."""
+    pose = at(standing().pose, (0, 0))
+    return HEEL + float(pose.toe.pos[2] - pose.ankle.pos[2]) + TOE
 
 
 def test_a_lower_limit_makes_slides_shorter():
-    """They go in fifths of a sole, of 0.05 m, and may pass their limit by a part of one."""
+    """They go in tenths of a sole, of 0.026 m, and no further than they need to."""
     longest = [np.abs(slides(DROP_BEHIND, max_slide=x)[0]).max() for x in (0.0, 0.06, 0.1)]
-    np.testing.assert_allclose(longest, [0.0, 0.052, 0.104], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(longest, [0.0, 0.052, 0.077], rtol=0, atol=2e-3)
 
 
 def test_a_swinging_foot_slides_gradually_from_one_foothold_to_the_next():
-    frames = swing(np.linspace(0.0, 1.0, 801), last=-0.6, following=0.03)
+    frames = swing(np.linspace(0.0, 1.0, 801), last=-0.6, following=0.12)
     slide, *_ = slides(WALL_BEHIND, frames)
     assert slide[0] == 0 and slide[-1] > 0.09
     assert (np.diff(slide) >= 0).all() and np.diff(slide).max() < 0.001
@@ -301,6 +319,18 @@ def test_strides_that_are_not_used_are_as_if_unknown():
     assert np.abs(unused.ankle.point - used.ankle.point).max() > 0.1
 
 
+@pytest.mark.parametrize(
+    ("name", "less", "more"), [("clearance", 0.0, 0.05), ("toe_length", 0.02, 0.08)]
+)
+def test_the_whole_sole_clears_an_edge(name: str, less: float, more: float):
+    """The longer it is, and the less of its animated lift it may lose, the higher it goes."""
+    still: dict[str, Any] = {"swing_as_animated": True, "max_slide": 0.0, "min_sole": 0.0}
+    ground = [hits(HURDLE, None, **still | {name: value}) for value in (less, more)]
+    swinging = np.asarray(walked().stride.fraction) > 0
+    rise = (ground[1].ankle.point - ground[0].ankle.point)[..., 1][swinging]
+    assert rise.max() > 0.002 and rise.min() > -1e-9
+
+
 @pytest.mark.parametrize("way", [1.0, -1.0], ids=["up", "down"])
 def test_steps_higher_than_captured_ones_change_a_swing_no_more(way: float):
     low, high, higher = (hits(step_up(way * height)) for height in (0.2, 0.35, 0.5))
@@ -328,7 +358,7 @@ def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
 
 # Heels that rise about the ball, compared with a numerical search and along a walk.
 
-RISES, STAYS = 0.2, 0.4  # sine of a leg's angle ahead of its hip
+RISES, STAYS = 0.0, 0.3  # sine of a leg's angle ahead of its hip
 VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.1, "probe.swing_as_animated": True}
 
 

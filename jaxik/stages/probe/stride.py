@@ -52,10 +52,10 @@ class StrideProbe(AbstractSupportedProbe):
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
-    a ledge nor snaps onto a wall, but climbs stairs. Rays along the way lift the foot over edges up
-    to `max_step_up` high, on slopes of `way_slope` before and after each edge. Where the ground is
-    above the curve, heel and ball clear it by as much as the animation lifts them, less
-    `clearance`.
+    a ledge nor snaps onto a wall, but climbs stairs. A foot that stands has no other foothold's
+    ground. Rays along the way find the highest edge over the line between the footholds, up to
+    `max_step_up` high; the foot clears it in one arc, of which its animated lift, less `clearance`,
+    is a part.
     """
 
     ray_up: Leaf = parameter(

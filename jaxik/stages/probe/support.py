@@ -20,12 +20,13 @@ from .swing import AbstractSwingProbe, Level
 
 # In tenths of a sole, from the ball: the points of a sole, and how far it may slide.
 SOLE = np.arange(-8, 3)
-SLIDES = np.array([0, 1, -1, 2, -2, 3, -3, 4, -4])  # the shorter of equals comes first
+SLIDES = np.array([0, 1, -1, 2, -2, 3, -3, 4, -4])
 LINE = np.arange(SOLE[0] + SLIDES.min(), SOLE[-1] + SLIDES.max() + 1)
 EVEN, UNEVEN = 0.06, 0.14  # of the sole, from its plane: ground that supports it, and does not
-BLOCKS = 2.0  # by which ground that sticks out counts against what supports
+BLOCKS = 4.0  # by which ground that sticks out counts against what supports
 SLIDE_COST = 0.15  # of the sole that a slide by the whole of it has to gain
-TOO_FAR = 2.0  # of the sole, more than any slide gains
+AHEAD = 0.1  # tenths of the sole, by which a place ahead counts as nearer: no two are equal
+TOO_FAR = 6.0  # of the sole, more than any slide gains
 FIFTH = 0.2  # of the sole, over which slides become too far
 SHARE_BAND = 0.01  # of the sole
 
@@ -33,11 +34,12 @@ SHARE_BAND = 0.01  # of the sole
 class AbstractSupportedProbe(AbstractSwingProbe):
     """The parameters of soles that slide to ground that supports them.
 
-    Six points of a sole, from heel to tip, look for ground on the plane on which the foot stands.
-    Where less than `min_sole` of it has some, the foot slides forward or back along itself to where
-    more has, if it can without a change of height, as people place their feet on stairs. Ground
-    that sticks out above the plane, as the stair behind a heel does, counts against the foot: on
-    captured people a third of a sole hangs over an edge at times, but nothing cuts into it.
+    Eleven points of a sole, from heel to tip, look for ground on the plane on which it stands.
+    Where less than `min_sole` of it has some, or the ball is on ground that is refused, such as a
+    riser, the foot slides forward or back along itself to the nearest place that holds it, as
+    people place their feet on stairs, on whatever tread that is. Ground that sticks out above the
+    plane, as the stair behind a heel does, counts against the foot four times: on captured people a
+    third of a sole hangs over an edge at times, but nothing cuts into it.
 
     Only footholds that the animation gives are moved: a prediction is off by as much as a slide.
     In a swing the slide goes from that of the last foothold to that of the next.
@@ -119,7 +121,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
                 blocked += block / len(SOLE)
             slide = tenths * tenth + jnp.zeros_like(share)
             lack = self.min_sole - firm[ball] * (share - BLOCKS * blocked)
-            cost = jnp.where(lack > 0, lack, 0.0) + SLIDE_COST * 0.1 * abs(tenths)
+            cost = jnp.where(lack > 0, lack, 0.0) + SLIDE_COST * 0.1 * abs(tenths - AHEAD)
             too_far = smoothstep((jnp.abs(slide) - self.max_slide) / (FIFTH * sole))
             if tenths:
                 too_far = lerp(jnp.ones_like(too_far), too_far, stride.known)

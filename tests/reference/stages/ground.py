@@ -94,7 +94,7 @@ class Foot(Leg):
         cosine = max(float(self.hit.normal @ self.up), math.cos(self["target.max_slope"]))
         on_ground = self.hit.point + self.up * self["target.foot_height"] * (1.0 / cosine - 1.0)
         animated = self.pos_ws("ankle") - self.up * (self.lift - self.swing_lift)
-        return lerp(animated, on_ground, self.hit.found)
+        return animated + self.hit.found * (on_ground - animated)
 
 
 def sense(leg: Leg) -> Foot:

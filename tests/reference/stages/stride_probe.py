@@ -27,7 +27,7 @@ STAIRS = 0.75  # rise over run
 HEEL, TIP = -8, 2
 FURTHEST = 4
 SUPPORTS, DOES_NOT = 0.06, 0.14
-STICKING, SLIDING = 2.0, 0.15  # cost of all of a sole that sticks in the ground, or slides away
+STICKING, SLIDING = 4.0, 0.15  # cost of all of a sole that sticks in the ground, or slides away
 
 # Of a swing: parts of its time when each bump is highest.
 SHARPNESS = 7.0
@@ -187,7 +187,11 @@ def slide(leg: Leg, level_point: Array, known: bool) -> Slide:
         share, stuck = fit(place)
         far = abs(place) / 10.0
         lack = max(leg["probe.min_sole"] - share + STICKING * stuck, 0.0)
-        return lack + SLIDING * far + 2.0 * smooth01(5.0 * (far - leg["probe.max_slide"] / sole))
+        return (
+            lack
+            + SLIDING * abs(place - 0.1) / 10.0
+            + 6.0 * smooth01(5.0 * (far - leg["probe.max_slide"] / sole))
+        )
 
     places = sorted(range(FURTHEST, -FURTHEST - 1, -1), key=abs) if known else [0]
     best = min(places, key=cost)
@@ -296,7 +300,7 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
 
     point = here + leg.up * (beside_ball(ankle) + lift_over_edges())
     stride = replace(stride, lift=lift * ball.found, pitch=pitch * ball.found)
-    normal = unit(lerp(leg.up, ball.normal, ball.found), leg.up)
+    normal = unit(leg.up + ball.found * (ball.normal - leg.up), leg.up)
     return Hit(ball.found, point, normal, ball.platform), stride
 
 
