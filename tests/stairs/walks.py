@@ -98,7 +98,7 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
     """The frames of a walk over a flight, with its root on the ground, and on a level floor."""
     walk = choose(flight)
     first = round((1.0 + flight.phase) * walk.stride * FPS)
-    frames = jax.tree.map(lambda x: np.asarray(x, np.float64)[first : first + FRAMES], walk.frames)
+    frames = jax.tree.map(lambda x: np.array(x, np.float64)[first : first + FRAMES], walk.frames)
     turn = np.array([np.cos(flight.heading / 2), 0.0, np.sin(flight.heading / 2), 0.0])
     rot = Rotation.from_rotvec([0.0, flight.heading, 0.0])
     away = frames.world_from_model.pos[0] * [1.0, 0.0, 1.0]
@@ -121,7 +121,7 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
         frames, world_from_model=world, velocity_ws=rot.apply(frames.velocity_ws), stride=stride
     )
     # The way before and after it, too, since the root looks a stride ahead and back.
-    around = np.asarray(walk.frames.world_from_model.pos, np.float64)
+    around = np.array(walk.frames.world_from_model.pos, np.float64)
     path = flight.heights(turned(around)[:, 2])
     rise = ground_path.smooth(path, walk.stride * FPS)[first : first + FRAMES]
     return level.translated(rise[:, None] * [0.0, 1.0, 0.0]), level

@@ -275,7 +275,7 @@ def lock(
         or foot.weight == 0.0
     )
     relockable = factor <= foot["lock.relock_threshold"] and is_slow("lock.max_speed")
-    may_lock = was_locked or (foot.planted and relockable and foot.hit.found)
+    may_lock = was_locked or (foot.planted and relockable and foot.hit.found > 0)
     locked = may_lock and not must_release
 
     if locked:
