@@ -76,6 +76,19 @@ def test_a_jitter_of_all_that_goes_in_moves_nothing_by_more_than_its_share(prese
     assert np.array_equal(reached[: len(rows)], reached[len(rows) :])
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_small_weight_of_all_legs_moves_the_body_no_further_than_a_large_one(preset: str):
+    ik, rig = getattr(jaxik.presets, preset)(), to_rig(clips.make_rig())
+    frames, weights = wandering(), (0.01, 0.05, 0.09, 0.3, 1.0)
+    rows = [dataclasses.replace(frames, weight=jnp.full((FRAMES, 2), w)) for w in weights]
+    run = jax.jit(
+        jax.vmap(lambda frames: jaxik.run(ik, rig, to_terrain(BROKEN), frames).body.pos),
+        compiler_options=QUICK,
+    )
+    furthest = np.linalg.norm(run(stacked(rows)), axis=-1).max(axis=1)
+    assert np.all(furthest[:-1] <= 1.02 * furthest[-1]), dict(zip(weights, furthest, strict=True))
+
+
 # No comparison asks whether floats are equal.
 
 

@@ -90,19 +90,24 @@ def greatest_count(sensed: Sensed) -> Float[Array, ""]:
     return HARD.maximum(sensed.counted, band=0.0)
 
 
-def lifted_out(sensed: Sensed, heights: Array) -> Float[Array, " legs"]:
-    """Heights, m, those of legs that do not count so high that they are no minimum of all."""
-    away = heights + AWAY * (1.0 - sensed.counted)
+def lifted_out(
+    sensed: Sensed, heights: Array, most: Array | float = 1.0
+) -> Float[Array, " legs"]:
+    """Heights, m, so much higher that those of legs that count less than the `most` limit nothing.
+
+    Without `most`, a leg that does not count in full limits less, even if none counts more.
+    """
+    away = heights + AWAY * (most - sensed.counted)
     return jnp.where(sensed.weight > 0, away, FAR)
 
 
 def lowest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
-    """The lowest of the heights of legs that count, m; `FAR` if none does."""
-    return gate.minimum(lifted_out(sensed, heights), band=HEIGHT_BAND)
+    """The lowest of the heights of the legs that count most, m; `FAR` if none does."""
+    return gate.minimum(lifted_out(sensed, heights, greatest_count(sensed)), band=HEIGHT_BAND)
 
 
 def highest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
-    """The highest of the heights of legs that count, m; `-FAR` if none does."""
+    """The highest of the heights of the legs that count most, m; `-FAR` if none does."""
     return -lowest_of(gate, sensed, -heights)
 
 
