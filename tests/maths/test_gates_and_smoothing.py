@@ -239,9 +239,9 @@ def test_the_clamped_speed_equals_unreals_interp_to():
 @functools.partial(jax.jit, static_argnums=3)
 def fades(start: float, goal: float, time: ArrayLike, frames: int) -> jax.Array:
     """A weight after so many frames of 1/60 s that goes all the way in `time`, s."""
-    start, step = jnp.asarray(start), smoothing.step_of_time(jnp.asarray(time), jnp.asarray(1 / 60))
+    step = smoothing.step_of_time(jnp.asarray(time), jnp.asarray(1 / 60))
     toward = functools.partial(smoothing.move_towards, goal=jnp.asarray(goal), step=step)
-    return jax.lax.fori_loop(0, frames, lambda _, weight: toward(weight), start)
+    return jax.lax.fori_loop(0, frames, lambda _, weight: toward(weight), jnp.asarray(start))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

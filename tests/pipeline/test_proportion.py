@@ -18,6 +18,7 @@ FRAMES = 90
 JITTER, LARGEST = 1e-7, 1e-5  # of each number that goes in; m, of what comes out
 FRACTIONS = ("weight", "grounded", "slide", "standing", "fraction", "known")
 SIZES = ("foot_speed", "toe_speed")
+ROWS, WEIGHTS = 5, (0.01, 0.05, 0.09, 0.3, 1.0)  # clips; of all legs
 PRESETS = ("record", "ozz", "unreal", "mec", "stride")
 RNG = np.random.default_rng(5)
 
@@ -55,38 +56,33 @@ def jittered(frames: jaxik.Frame) -> jaxik.Frame:
     return jax.tree_util.tree_map_with_path(jitter, frames)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_jitter_of_all_that_goes_in_moves_nothing_by_more_than_its_share(preset: str):
-    ik, rig, ground = (
-        getattr(jaxik.presets, preset)(),
-        to_rig(clips.make_rig()),
-        to_terrain(BROKEN),
-    )
+@pytest.fixture(scope="module", params=PRESETS)
+def result(request) -> jaxik.Result:
+    """All that a preset makes of the clips, of these jittered, and of all legs with few weights."""
+    ik, rig = getattr(jaxik.presets, request.param)(), to_rig(clips.make_rig())
     frames = wandering()
     rows = [frames, *at_the_ends(frames)]
+    assert len(rows) == ROWS
+    faint = [dataclasses.replace(frames, weight=jnp.full((FRAMES, 2), w)) for w in WEIGHTS]
     run = jax.jit(
-        jax.vmap(lambda frames: jaxik.run(ik, rig, ground, frames)), compiler_options=QUICK
-    )
-    result = run(stacked([*rows, *map(jittered, rows)]))
-    for joint in ("hip", "knee", "ankle", "toe"):
-        places = np.asarray(getattr(result.pose, joint).pos)
-        apart = np.abs(places[len(rows) :] - places[: len(rows)]).max(axis=(2, 3))
-        assert apart.max() < LARGEST, (joint, apart.max(axis=1), apart.argmax(axis=1))
-    reached = np.asarray(result.reached)
-    assert np.array_equal(reached[: len(rows)], reached[len(rows) :])
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_small_weight_of_all_legs_moves_the_body_no_further_than_a_large_one(preset: str):
-    ik, rig = getattr(jaxik.presets, preset)(), to_rig(clips.make_rig())
-    frames, weights = wandering(), (0.01, 0.05, 0.09, 0.3, 1.0)
-    rows = [dataclasses.replace(frames, weight=jnp.full((FRAMES, 2), w)) for w in weights]
-    run = jax.jit(
-        jax.vmap(lambda frames: jaxik.run(ik, rig, to_terrain(BROKEN), frames).body.pos),
+        jax.vmap(lambda frames: jaxik.run(ik, rig, to_terrain(BROKEN), frames)),
         compiler_options=QUICK,
     )
-    furthest = np.linalg.norm(run(stacked(rows)), axis=-1).max(axis=1)
-    assert np.all(furthest[:-1] <= 1.02 * furthest[-1]), dict(zip(weights, furthest, strict=True))
+    return run(stacked([*rows, *map(jittered, rows), *faint]))
+
+
+def test_a_jitter_of_all_that_goes_in_moves_nothing_by_more_than_its_share(result):
+    for joint in ("hip", "knee", "ankle", "toe"):
+        places = np.asarray(getattr(result.pose, joint).pos)
+        apart = np.abs(places[ROWS : 2 * ROWS] - places[:ROWS]).max(axis=(2, 3))
+        assert apart.max() < LARGEST, (joint, apart.max(axis=1), apart.argmax(axis=1))
+    reached = np.asarray(result.reached)
+    assert np.array_equal(reached[:ROWS], reached[ROWS : 2 * ROWS])
+
+
+def test_a_small_weight_of_all_legs_moves_the_body_no_further_than_a_large_one(result):
+    furthest = np.linalg.norm(result.body.pos[2 * ROWS :], axis=-1).max(axis=1)
+    assert np.all(furthest[:-1] <= 1.02 * furthest[-1]), dict(zip(WEIGHTS, furthest, strict=True))
 
 
 # No comparison asks whether floats are equal.

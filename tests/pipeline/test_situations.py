@@ -47,9 +47,9 @@ def ankles(result: jaxik.Result) -> np.ndarray:
 
 
 @pytest.mark.parametrize("preset", GAMES)
-@pytest.mark.parametrize("height", [0.45, 2.4, 5.0])
-def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, height: float):
-    above = boxes(FLOOR, (height, -0.4, 0.4, -0.8, 0.0) if height < 1 else (height, -5, 5, -5, 5))
+@pytest.mark.parametrize("roof", [2.4, 5.0])
+def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, roof: float):
+    above = boxes(FLOOR, (0.45, -0.4, 0.4, -0.8, 0.0), (roof, -5, 5, -5, 5))
     frames = standing_clip()
     result = run(getattr(jaxik.presets, preset)(), above, frames)
     np.testing.assert_allclose(result.body.pos, 0.0, atol=0.05)

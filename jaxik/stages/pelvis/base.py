@@ -90,9 +90,7 @@ def greatest_count(sensed: Sensed) -> Float[Array, ""]:
     return HARD.maximum(sensed.counted, band=0.0)
 
 
-def lifted_out(
-    sensed: Sensed, heights: Array, most: Array | float = 1.0
-) -> Float[Array, " legs"]:
+def lifted_out(sensed: Sensed, heights: Array, most: Array | float = 1.0) -> Float[Array, " legs"]:
     """Heights, m, so much higher that those of legs that count less than the `most` limit nothing.
 
     Without `most`, a leg that does not count in full limits less, even if none counts more.
