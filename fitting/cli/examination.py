@@ -27,6 +27,7 @@ LONGEST = 300.0  # s, for what needs JAX; it takes half a minute on two slow cor
 WITH_JAX = "fitting.cli.with_jax"
 
 PACKAGES = ("jaxik", "fitting")
+COMMANDS = "fit"  # the extra that brings what every command needs
 FOR_DEVELOPERS = {"test", "dev", "docs", "mutation"}  # extras that no command needs
 
 CPU, MEMORY = Path("/proc/cpuinfo"), Path("/proc/meminfo")  # on Linux
@@ -133,20 +134,19 @@ def examine_installation() -> Iterator[Finding]:
         problem = "jaxik is not installed, only its source is on the path"
         yield Finding("jaxik", str(Path(__file__).parents[2]), problem, "pip install jaxik")
         return
-    needed = [requirement for requirement in requirements if requirement.marker is None]
-    yield _packages("packages", needed, "pip install --upgrade jaxik")
+    needed = [requirement for requirement in requirements if _is_of(requirement, COMMANDS)]
+    yield _packages("packages", needed, 'pip install --upgrade "jaxik[fit]"')
+    names = {requirement.name for requirement in needed}
     for extra in metadata.metadata("jaxik").get_all("Provides-Extra") or ():
-        if extra not in FOR_DEVELOPERS:
-            yield _extra(extra, [r for r in requirements if _is_of(r, extra)])
+        if extra not in (COMMANDS, *FOR_DEVELOPERS):
+            others = [r for r in requirements if _is_of(r, extra) and r.name not in names]
+            yield _extra(extra, others)
     yield from _names_in(Path.cwd())
 
 
 def _is_of(requirement: Requirement, extra: str) -> bool:
-    """Whether it is needed for this extra, and not without it."""
-    marker = requirement.marker
-    if marker is None or marker.evaluate({"extra": ""}):
-        return False
-    return marker.evaluate({"extra": extra})
+    """Whether it is needed with this extra."""
+    return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
 def _extra(extra: str, requirements: list[Requirement]) -> Finding:

@@ -7,9 +7,10 @@ in it, so that the command line can draw them; to everybody else it is what it s
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from fitting.motion.measures import Figures, Measure
+if TYPE_CHECKING:  # they need JAX, which `jaxik doctor` shows tables without
+    from fitting.motion.measures import Figures, Measure
 
 Table: TypeAlias = list[list[str]]  # rows of cells, the heading first
 
@@ -167,7 +168,7 @@ DIFFERENCES = {  # of `motion.accuracy`
 }
 
 
-def figures_table(title: str, motions: Mapping[str, Figures], names: Iterable[str] = ()) -> Table:
+def figures_table(title: str, motions: "Mapping[str, Figures]", names: Iterable[str] = ()) -> Table:
     """Figures of motions, a row for each with its unit; those that none has are left out.
 
     Args:
@@ -185,6 +186,6 @@ def figures_table(title: str, motions: Mapping[str, Figures], names: Iterable[st
     return [[title, *motions], *rows]
 
 
-def meanings(measures: Mapping[str, Measure]) -> list[list[str]]:
+def meanings(measures: "Mapping[str, Measure]") -> list[list[str]]:
     """What each measure means: its heading with its unit, and a text."""
     return [[f"{each.heading} ({each.unit})", each.meaning] for each in measures.values()]
