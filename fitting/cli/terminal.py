@@ -53,7 +53,7 @@ def watched() -> Iterator[None]:
         console_in_use.reset(token)
 
 
-def can_draw(stream: TextIO | None) -> bool:
+def can_draw(stream: "TextIO | _Stream | None") -> bool:
     """Whether a stream is a terminal that knows escape codes and lines; None is a closed one."""
     if stream is None or not stream.isatty():
         return False
@@ -62,7 +62,7 @@ def can_draw(stream: TextIO | None) -> bool:
     return knows_lines and os.environ.get("TERM", "").lower() not in INCAPABLE
 
 
-def make_console(stream: TextIO | None) -> "Console | None":
+def make_console(stream: "TextIO | _Stream | None") -> "Console | None":
     """What draws on a stream; None where nothing can, or where rich cannot be imported."""
     if not can_draw(stream):
         return None
@@ -114,7 +114,7 @@ class PlainLines(Shown):
     since what takes long cannot.
     """
 
-    def __init__(self, stream: TextIO):
+    def __init__(self, stream: "TextIO | _Stream"):
         self._stream = stream
         self._lock = threading.RLock()
         self._going_on: list[Work] = []

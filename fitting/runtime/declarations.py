@@ -118,7 +118,7 @@ def keys(table: type) -> dict[str, Key]:
 
 
 def _declared(
-    hint: Any, low: float | None, high: float | None, unit: str
+    hint: Any, low: int | float | None, high: int | float | None, unit: str
 ) -> tuple[Constraint, type | None]:
     """What a type accepts, and the declaration of the table or tables in it."""
     origin, arguments = get_origin(hint), get_args(hint)
