@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NotRequired, TypedDict, TypeVar
@@ -184,15 +185,15 @@ def _check(parameters: Sequence[str], result: Mapping[str, Any]) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Judgement:
+class Judgement(ABC):
     """What is found in replicates; some of it is checked."""
 
     replicates: int
 
     @property
+    @abstractmethod
     def checks(self) -> Mapping[str, Proportion | RankTest]:
         """What is checked, by what is said of it where it is outside its bounds."""
-        raise NotImplementedError
 
     @property
     def outside(self) -> list[str]:
