@@ -1,5 +1,6 @@
 """The report of the suite: a table with its explanation, the numbers, and a page of pictures."""
 
+import textwrap
 from collections import Counter
 from typing import Any
 
@@ -44,6 +45,7 @@ MARGIN = 0.3  # m, around what is shown
 JUMP = 1.0  # m in a frame, from which a line is interrupted
 HEAD = 0.5, 1.45  # place of a column's heading, in heights of a panel
 SAMPLES = 600  # of the ground
+TITLE = 42  # characters over a panel, in a line
 
 
 def missed(suite: Suite) -> list[str]:
@@ -172,9 +174,8 @@ def _heights(scene: Scene) -> tuple[float, float]:
 
 def _title(axes: Axes, missed: list[str]) -> None:
     """Says what misses its bound, in red, with a red frame."""
-    middle = (len(missed) + 1) // 2
-    lines = [part for part in (missed[:middle], missed[middle:]) if part]
-    axes.set_title("\n".join(", ".join(line) for line in lines), fontsize=7, color=RED)
+    whole = ", ".join(part.replace(" ", "\xa0") for part in missed)  # no part is broken
+    axes.set_title(textwrap.fill(whole, TITLE), fontsize=7, color=RED)
     for spine in axes.spines.values() if missed else ():
         spine.set(visible=True, color=RED)
 
