@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from fitting.runtime import activity
 from fitting.runtime.activity import Work
@@ -70,7 +70,8 @@ def make_console(stream: "TextIO | _Stream | None") -> "Console | None":
         from rich.console import Console
     except ImportError:  # `jaxik doctor` says so, and must be able to
         return None
-    return Console(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False)
+    file = cast("IO[str]", stream)  # rich needs no more of a stream than ours has
+    return Console(file=file, force_terminal=True, highlight=False, markup=False, emoji=False)
 
 
 def show(text: str) -> None:

@@ -1,13 +1,14 @@
 """Stage 10: where each leg goes once the body has moved, and how much foot IK it gets."""
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
@@ -34,7 +35,7 @@ class Effector:
     """0..1, how much of its weight each leg gets."""
 
 
-def _contact_switch() -> Declared:
+def _contact_switch() -> Any:
     doc = "Whether a foot gets as much foot IK as its contact, so that it swings as animated."
     return switch(False, doc=doc)
 
