@@ -29,6 +29,8 @@ STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts 
 LEVEL = 1e-3  # m, between the heights of ground that counts as a level floor
 MISSING = 0.5  # of the points of soles that may be without ground
 FLAT_SLIDE = 0.002  # m, the bound of slides on a level floor, where nothing has to move a foot
+SKID = 0.025 / 0.05  # m/s, of an adult, from which a foot in contact skates: 2.5 cm at 20 Hz
+CONTACT_HEIGHT = 0.05  # m, of an adult, below which a ball can be in contact
 SWING_PEAK = 1.875  # speed of a path of minimum jerk at its middle, over its mean speed
 
 CLOSE = 0.1  # relative difference from a factor
@@ -99,16 +101,7 @@ class Measure:
 def declared(
     heading: str, unit: str, digits: int, meaning: str, *, formerly: str = "", **bound: Any
 ) -> Any:
-    """A field of `Figures`, declared by the arguments of `Measure`.
-
-    Args:
-        heading: and what follows, as `Measure` has it.
-        unit: likewise.
-        digits: likewise.
-        meaning: likewise.
-        formerly: its name in the files of earlier releases.
-        bound: likewise, with its reason.
-    """
+    """A field of `Figures`: the arguments of `Measure`, and its name in earlier files."""
     measure = Measure(heading, unit, digits, meaning, **bound)
     return field(metadata={"measure": measure} | ({"formerly": formerly} if formerly else {}))
 
@@ -190,6 +183,15 @@ class Measures(Figures):
         bound=VISIBLE,
         reason="further slides are seen; on a level floor, where nothing has to move a foot, "
         f"{1000 * FLAT_SLIDE:.0f} mm",
+    )  # fmt: skip
+    foot_skating: float = declared(
+        "foot skating", "% of frames", 1,
+        "Foot-skating ratio (Karunratanakul et al. 2023): frames in which either foot skids by "
+        f"more than 2.5 cm in 1/20 s while its ball is in contact, less than "
+        f"{100 * CONTACT_HEIGHT:.0f} cm above the ground. Contacts are the animation's stances, as "
+        "swings over uneven ground pass it as closely.",
+        bound=0.05,
+        reason="a foot that skids is seen; in 5 % of the frames that passes",
     )  # fmt: skip
     pop: float = declared(
         "pop", "cm in 1/60 s", 1,
@@ -403,6 +405,7 @@ def measure(
         contact=_mean(~in_ground & ~above, stance & known),
         groundless=float(np.mean(np.isnan(feet.ground))),
         slide=float(np.median(known_slides)) if known_slides.size else math.nan,
+        foot_skating=_foot_skating(feet, solved, size),
         pop=_extreme(speed, names).value,
         pops=float(sum(len(contacts.runs(of_leg > visible)) for of_leg in speed.T)),
         knee_jerk=jerk(knee_angle(hip, knee, ankle), solved.fps, solved.cuts),
@@ -444,6 +447,15 @@ def _of_stances(path: Float64[np.ndarray, "frames legs"]) -> Float64[np.ndarray,
             if last > first:
                 slides[first, leg] = path[last, leg]
     return slides
+
+
+def _foot_skating(feet: Soles, solved: Clip, size: float) -> float:
+    """The foot-skating ratio over all steps from one frame to the next; NaN if none is known."""
+    height, steps = feet.height[..., 1], horizontal_steps(solved.joints_ws(3), solved.cuts)
+    in_contact = feet.stance & (height < CONTACT_HEIGHT * size)  # false for NaN
+    known = ~np.isnan(height)
+    skids = in_contact[1:] & in_contact[:-1] & (steps * solved.fps > SKID * size)
+    return _mean(np.any(skids, axis=1), np.any(known[1:] & known[:-1], axis=1))
 
 
 def horizontal_steps(

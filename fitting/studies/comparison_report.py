@@ -58,7 +58,7 @@ RATES = (
 COLOURS = (*STAGES, CAPTURED)
 Dashes: TypeAlias = Literal["-", "--", ":"]
 DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
-BAR_PANELS = 5  # in a row
+BAR_PANELS = 4  # in a row
 
 RADIUS = 0.018  # m, of the bones of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has

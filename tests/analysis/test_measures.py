@@ -101,6 +101,31 @@ def test_slide_is_the_median_over_the_stances_of_all_feet(walk):
     assert measure(sliding, still, stance=stances).slide == pytest.approx((0.02 + 0.05) / 2)
 
 
+# Foot skating
+
+
+@pytest.mark.parametrize("fps", [20.0, 60.0, 120.0])
+def test_foot_skating_is_the_share_of_frames_in_which_a_foot_in_contact_skids(walk, fps):
+    frames = 41  # 40 steps
+    still = standing(walk, frames, fps)
+    size, path = measure(still).size, np.zeros((2, frames, 3))
+    for speed, ratio in ((0.49, 0.0), (0.51, 1.0)):  # m/s, of an adult
+        path[0, :, 2] = size * speed * np.arange(frames) / fps
+        assert measure(moved(still, BALL, path[0])).foot_skating == ratio, "either foot"
+    path[0, 21:] = path[0, 20]
+    path[1, 31:, 0] = 0.1  # in one step, which the other foot has not
+    path[1, :, 1] = np.arange(frames)  # up and down does not count
+    both = moved(moved(still, BALL, path[0]), BALL, path[1], leg=1)
+    assert measure(both).foot_skating == pytest.approx(21 / 40)
+    gap, stance = np.zeros((frames, 2)), np.ones((frames, 2), bool)
+    gap[:5, 0] = 0.051 * size  # not in contact at the beginning of 5 steps
+    assert measure(both, gap=gap).foot_skating == pytest.approx(16 / 40)
+    stance[30, 1] = False
+    assert measure(both, gap=gap, stance=stance).foot_skating == pytest.approx(15 / 40)
+    gap[:11] = np.nan  # nothing is known of 11 steps
+    assert measure(both, gap=gap, stance=stance).foot_skating == pytest.approx(9 / 29)
+
+
 # Pops
 
 
@@ -295,7 +320,7 @@ def test_a_slide_is_the_path_of_the_ball_beyond_the_animated_one(walk):
 
 def test_a_walk_stands_on_its_floor_and_a_pop_is_a_jump_of_an_ankle_from_the_pelvis(walk):
     placed = measures.place(walk, walk, walk, FLOOR).measures
-    assert placed.slide == placed.worst["slide"].value == placed.pop == 0.0
+    assert placed.slide == placed.worst["slide"].value == placed.foot_skating == placed.pop == 0.0
     assert placed.floating == placed.penetration == placed.groundless == 0.0
     assert not placed.misplaced
     step = np.where(np.arange(walk.frame_count) >= 77, 0.06, 0.0)[:, None] * [0.0, 1.0, 0.0]
@@ -306,7 +331,7 @@ def test_a_walk_stands_on_its_floor_and_a_pop_is_a_jump_of_an_ankle_from_the_pel
     assert popless.pop == pytest.approx(0.0, abs=1e-12)
     still = walk.select(slice(0, 1))
     placed = measures.place(still, still, still, FLOOR).measures
-    assert np.isnan([placed.slide, placed.pop]).all(), "of one frame"
+    assert np.isnan([placed.slide, placed.foot_skating, placed.pop]).all(), "of one frame"
 
 
 def test_feet_are_not_measured_in_masked_frames(walk):

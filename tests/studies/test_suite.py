@@ -181,7 +181,7 @@ def test_the_command_prints_the_table_whatever_is_in_it(monkeypatch, still, tmp_
     words = ["compare", "--suite", "--quick", "--only", "stairs up", "-o", str(tmp_path)]
     assert main.main(words) == 0
     printed = capsys.readouterr()
-    assert re.search(r"^\d+ of 6 within bounds\.$", printed.out, re.MULTILINE)
+    assert re.search(rf"^\d+ of {len(BOUNDED)} within bounds\.$", printed.out, re.MULTILINE)
     assert comparison_report.MISS in printed.out and "\x1b" not in printed.out
 
 
