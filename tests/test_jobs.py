@@ -415,7 +415,7 @@ def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
     assert main.main(["sample", str(run), "--max-steps", "300"]) == main.INTERRUPTED
     output = capsys.readouterr().out
     assert "interrupted; summarising and writing the chain" in output
-    assert "Interrupted, the chain is kept" in output
+    assert "Interrupted, the chain is saved" in output
     assert len(chain_of(run)) == 100
 
 

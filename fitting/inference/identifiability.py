@@ -1,7 +1,7 @@
 """What the data determine of a fit, and what they leave to the prior.
 
 Every parameter is judged by its profile: the lowest cost for each of its values, all others
-following. The Jacobian at the solution tells how parameters depend on each other.
+following. The Jacobian at the solution shows how parameters depend on each other.
 """
 
 import dataclasses
@@ -75,10 +75,10 @@ def find_ridges(
         undetermined: names among which ridges are sought.
     """
     index = {parameter.name: i for i, parameter in enumerate(parameters)}
-    found: list[Ridge] = []
+    ridges: list[Ridge] = []
     for size in range(2, LARGEST + 1):
         for names in itertools.combinations(undetermined, size):
-            if any(set(ridge.names) <= set(names) for ridge in found):
+            if any(set(ridge.names) <= set(names) for ridge in ridges):
                 continue
             columns = [index[name] for name in names]
             chosen = [parameters[i] for i in columns]
@@ -86,8 +86,8 @@ def find_ridges(
             across = _across(np.stack(list(map(to_fractions, chosen, points.T)), axis=1))
             if across is not None:
                 coefficients = across / [scale_width(parameter) for parameter in chosen]
-                found.append(Ridge(names, tuple(map(float, coefficients / coefficients[0]))))
-    return tuple(found)
+                ridges.append(Ridge(names, tuple(map(float, coefficients / coefficients[0]))))
+    return tuple(ridges)
 
 
 def _allowed(profile: Profile) -> Float[np.ndarray, "points free"]:
@@ -135,8 +135,8 @@ def _combined(terms: Sequence[tuple[str, float]], signs: tuple[str, str], term: 
     for name, coefficient in terms:
         size = abs(coefficient)
         sign = signs[0] if coefficient * first > 0 else signs[1]
-        one = np.isclose(size, 1, atol=0.05)
-        words += (sign if words else "") + (name if one else term.format(name=name, size=size))
+        words += sign if words else ""
+        words += name if np.isclose(size, 1, atol=0.05) else term.format(name=name, size=size)
     return words
 
 
@@ -248,7 +248,7 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
 class _Laplace:
     """The normal approximation of the smooth parameters' posterior, in prior units.
 
-    The prior is approximated likewise: by a normal with the slope of its residual at the solution.
+    The prior, too, is approximated by a normal with the slope of its residual at the solution.
     """
 
     smooth: np.ndarray  # indices among the free parameters

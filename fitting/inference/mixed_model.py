@@ -51,7 +51,7 @@ Spreads = Float[np.ndarray, " parameters"]
 
 MAX_ROUNDS = 60
 SMALL_STEP = 0.01  # of a parameter's standard deviation: nothing moves by more at the end
-SMALL_CHANGE = 1e-3  # of a spread, relative to its scale, likewise
+SMALL_CHANGE = 1e-3  # of a spread at the end, relative to its scale
 HALVINGS = 12  # of a step
 
 Points = Float[np.ndarray, "clips free"]
@@ -259,13 +259,13 @@ class _Conditional(NamedTuple):
         grid = self.grid()
         best = int(np.argmax(self.log_density(grid)))
         bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        found = optimize.minimize_scalar(
+        optimum = optimize.minimize_scalar(
             lambda spread: -float(self.log_density(np.asarray(spread))),
             bounds=bounds,
             method="bounded",
             options={"xatol": 1e-9 * self.scale},
         )
-        return 0.0 if self.log_density(np.zeros(())) >= -found.fun else float(found.x)
+        return 0.0 if self.log_density(np.zeros(())) >= -optimum.fun else float(optimum.x)
 
     def density(self) -> SpreadDensity:
         """The distribution on the grid; in each cell, the density is that of its middle."""
@@ -287,7 +287,7 @@ class MixedModel:
     prior_information: Float[np.ndarray, " parameters"]
     """Of the centres."""
     prior_vector: Float[np.ndarray, " parameters"]
-    """Likewise, times their prior means."""
+    """The prior information times the prior means."""
     spread_scale: Spreads
     """Of the half-normal prior of the spreads."""
 
@@ -447,7 +447,7 @@ class MixedModel:
 
 @dataclasses.dataclass(frozen=True)
 class PopulationFit:
-    """The mode of a hierarchy, and the mixed model there."""
+    """The mode of the joint distribution, and the mixed model there."""
 
     centre: Float[np.ndarray, " free"]
     """In u; thresholds are where they were held."""
@@ -579,7 +579,7 @@ class _Search:
         """The mode that a start leads to."""
         likelihoods = expand(self.problems, start)
         if not _finite(likelihoods):
-            raise ValueError("residuals or derivatives are not finite where the hierarchy begins")
+            raise ValueError("residuals or derivatives are not finite where the mixed model begins")
         model = model_around(likelihoods, self.space, self.grouping, start.mean(axis=0))
         state = self._at(*self._mode(model, start))
         for rounds in range(1, MAX_ROUNDS + 1):

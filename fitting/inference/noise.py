@@ -48,7 +48,7 @@ TAIL_RANGE = (1.5, 100.0)  # degrees of freedom; from 100 on, Student's t is nea
 ITERATIONS = 100  # of the reweighting, at most
 TOLERANCE = 1e-8  # relative change of a variance that ends it
 
-STEP = 1e-4  # sigmas, over which the slope of a residual's influence is taken
+STEP = 1e-4  # sigmas, for the slope of a residual's influence by differences
 LEAST_SLOPE = 0.05  # on average; under Cauchy's loss that of far outliers is negative
 
 FARTHEST = 20.0  # inverse hyperbolic sine of the residual, in sigmas, at which the tails end
@@ -140,27 +140,27 @@ def likeliest(
 
     if correlation is not None:
         return at(correlation)
-    found = optimize.minimize_scalar(
+    optimum = optimize.minimize_scalar(
         lambda rho: -at(float(rho)).log_likelihood,
         bounds=(-MAX_CORRELATION, MAX_CORRELATION),
         method="bounded",
         options={"xatol": 1e-6},
     )
-    return at(float(found.x))  # pyright: ignore[reportAttributeAccessIssue]
+    return at(float(optimum.x))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def likeliest_tails(values: Float[np.ndarray, " values"]) -> float:
     """Degrees of freedom of Student's t for independent values in units of their sigma."""
-    found = optimize.minimize_scalar(
+    optimum = optimize.minimize_scalar(
         lambda log_nu: -log_density(values, "student", math.exp(log_nu)).sum(),
         bounds=[math.log(nu) for nu in TAIL_RANGE],
         method="bounded",
     )
-    return math.exp(float(found.x))  # pyright: ignore[reportAttributeAccessIssue]
+    return math.exp(float(optimum.x))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def information_of_slopes(loss: Loss, tails: float) -> float:
-    """What a residual tells of the parameters, over what its squared slope after the loss says.
+    """The information in a residual over its squared slope after the loss.
 
     1 for squares. Student's residual has the Fisher information `(nu + 1) / (nu + 3)` (Lange,
     Little and Taylor 1989), while the mean squared slope of its transformed one is larger. Losses
@@ -291,8 +291,9 @@ def with_noise(problem: Problem[jaxik.FootIK], noise: NoiseModel) -> Problem[jax
 
 def _with_noise(scene: Scene, noise: NoiseModel) -> Scene:
     sigmas = scene.sigmas
-    given = {kind: float(sigmas.correlation_of(kind)) for kind in WHITENED}
-    correlation = np.array([(given | dict(noise.correlations))[kind] for kind in WHITENED])
+    correlations = {kind: float(sigmas.correlation_of(kind)) for kind in WHITENED}
+    correlations |= noise.correlations
+    correlation = np.array([correlations[kind] for kind in WHITENED])
     changed = {kind: jax.device_put(np.float64(sigma)) for kind, sigma in noise.sigmas.items()}
     sigmas = dataclasses.replace(sigmas, **changed, correlation=jax.device_put(correlation))
     return dataclasses.replace(scene, sigmas=sigmas)
@@ -342,7 +343,7 @@ def _check_noise(sigmas: Mapping[str, float]) -> None:
             raise NoiseCollapse(
                 f"the noise of {kind} has collapsed: its likeliest sigma is {sigma:.2g}, and no "
                 f"capture is known to less than {least:g} (m, rad); what the system cannot follow "
-                'was taken for correlated noise, or nothing is left: take sigmas = "given" and '
+                'passed for correlated noise, or nothing is left: set sigmas = "given" and '
                 'correlation = "counted" in [noise]'
             )
 
@@ -358,10 +359,10 @@ def measured(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]
     }
     sigmas = {kind: max(own.sigma, LEAST_SIGMAS[kind]) for kind, own in estimates.items()}
     correlations = {kind: estimate.correlation for kind, estimate in estimates.items()}
-    shown = NoiseModel(
+    residual_noise = NoiseModel(
         {**noise.sigmas, **sigmas}, {**noise.correlations, **correlations}, noise.tails, weight=1.0
     )
-    return with_noise(problem, shown)
+    return with_noise(problem, residual_noise)
 
 
 @in_float64
@@ -565,7 +566,7 @@ def fit_with_noise(
 
     Args:
         problem: with the noise to begin with.
-        options: what of it is estimated; nothing leaves the solution as it is.
+        options: which properties are estimated; without any the solution stays as it is.
         solution: of the problem.
         settings: of the descents.
     """

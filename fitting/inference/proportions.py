@@ -4,7 +4,7 @@ Simulation-based calibration (Talts et al. 2018, arXiv 1804.06788) ranks truths 
 draws of their posteriors: with truths drawn from the prior and data simulated from them, ranks are
 uniform. The band of their empirical distribution function (ECDF) is that of Säilynoja, Bürkner and
 Vehtari (2022, Statistics and Computing 32:32): the pointwise binomial intervals, widened until
-whole curves lie inside with the level that is asked for. It is found by simulation.
+whole curves lie inside with the requested level, found by simulation.
 """
 
 import dataclasses
@@ -62,11 +62,11 @@ def proportion(
         wanted: range in which the probability should lie.
     """
     counted = np.ones_like(hits) if counted is None else counted
-    sizes, found = counted.sum(axis=1), (hits & counted).sum(axis=1)
-    total, hit = int(sizes.sum()), int(found.sum())
+    sizes, hits_of_each = counted.sum(axis=1), (hits & counted).sum(axis=1)
+    total, hit = int(sizes.sum()), int(hits_of_each.sum())
     cases = float(total)
     if hits.shape[1] > 1 and total:
-        cases = min(cases, _independent_cases(found, sizes, level))
+        cases = min(cases, _independent_cases(hits_of_each, sizes, level))
     fraction = hit / total if total else 0.0
     low, high = clopper_pearson(fraction * cases, cases, level)
     return Proportion(hit, total, low, high, *wanted)
@@ -83,13 +83,13 @@ def clopper_pearson(hits: float, total: float, level: float) -> tuple[float, flo
     return float(low), float(high)
 
 
-def _independent_cases(found: np.ndarray, sizes: np.ndarray, level: float) -> float:
+def _independent_cases(hits: np.ndarray, sizes: np.ndarray, level: float) -> float:
     """Number of independent cases whose fraction varies as much as that of these replicates."""
     replicates, total = len(sizes), sizes.sum()
     if replicates < 2:
         return float(replicates)
-    fraction = found.sum() / total
-    scatter = np.sum((found - fraction * sizes) ** 2) / total**2
+    fraction = hits.sum() / total
+    scatter = np.sum((hits - fraction * sizes) ** 2) / total**2
     variance = scatter * replicates / (replicates - 1)
     if not variance > 0:  # every replicate has the same fraction
         return float(total)

@@ -3,13 +3,13 @@
 Each parameter is swept over its range while the others stay at the system's values, and again at a
 few draws from a wide prior, for at one point a rule may happen to be idle. The mean slope of every
 residual over such a sweep, which also sees what lies behind a threshold or a limit, stands in for
-its derivative, and a normal approximation then tells how far the clips would narrow down the
+its derivative, and a normal approximation then shows how far the clips would narrow down the
 parameters together. The one they narrow down least is fixed, and so on, until they narrow down all.
 It is a forecast: what the clips do determine is for the fit to say.
 
 On flat ground a capture says nothing but that foot IK must not move the feet. Where a system moves
-them, the change of one parameter that helps most is kept, and so on, up to `MOST` changes, which
-are for a fit to refine.
+them, the parameter whose change helps most is changed, then the next one, up to `MOST` of them,
+which are for a fit to refine.
 """
 
 import dataclasses
@@ -34,16 +34,16 @@ from .identifiability import UNDETERMINED
 from .optimise.evolution import BATCH
 
 FRACTIONS = (np.arange(6) + 0.5) / 6  # of a range, where each parameter is tried
-DRAWS = 2  # random systems besides the given one: there a parameter may matter that here does not
+DRAWS = 2  # random systems besides the user's: there a parameter may matter that here does not
 NEGLIGIBLE = 0.1  # sigmas; what moves no residual further does not change the motion
 UNLIMITED = 4.0  # times its usual range, for an infinite limit: "no limit" must stay in reach
 
 FreeTable = Mapping[str, Mapping[str, float | int | str]]  # names, and overrides of declarations
 
-INDEPENDENT_EVERY = 0.5  # s between residuals of captured motion that tell something new
+INDEPENDENT_EVERY = 0.5  # s between residuals of captured motion that count as independent
 
 MOST = 4  # parameters that are changed
-AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
+AS_GOOD = 0.02  # of the possible gain in cost: among changes this similar, the smallest is chosen
 
 
 def all_parameters(ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> dict[str, dict[str, float]]:
@@ -152,7 +152,7 @@ class Forecast:
     contraction: float
     """Of its variance, alone: 0 where the clips say nothing, 1 where they decide."""
     rival: str = ""
-    """The free parameter from which they do not tell it apart; empty where they say little."""
+    """The free parameter with which they confuse it; empty where they say little."""
 
     @property
     def moves(self) -> bool:
@@ -234,12 +234,12 @@ def leave_alone(
     scenes: tuple[Scene, ...],
     is_harmless: Callable[[jaxik.FootIK], bool],
 ) -> list[str]:
-    """Names of the parameters that are to be changed; not more than are needed.
+    """Names of the parameters to change; no more than are needed.
 
     Args:
         ik: the system.
         candidates: the parameters, with overrides of their declarations.
-        scenes: the clips, whose animations are to be left as they are.
+        scenes: the clips, whose animations should stay as they are.
         is_harmless: whether a system leaves them alone, which ends the search.
     """
     rig = scenes[0].rig

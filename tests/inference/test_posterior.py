@@ -233,7 +233,7 @@ def test_an_interrupt_returns_the_chain_and_the_run_can_go_on(tmp_path, monkeypa
     path = tmp_path / "chain.h5"
     with listening(reported=interrupt):
         part = normal(3).sample(max_steps=90, path=path, check_every=5)
-    assert part.message.startswith("Interrupted, the chain is kept.") and not part.converged
+    assert part.message.startswith("Interrupted, the chain is saved.") and not part.converged
     assert np.array_equal(part.u, whole.u[:35])
     rest = normal(3).sample(max_steps=90, path=path)
     assert np.array_equal(rest.u, whole.u)

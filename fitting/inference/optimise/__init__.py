@@ -2,5 +2,5 @@
 
 `search` is the whole way, `solution` what it starts from, its state and what it ends with,
 `checkpoints` go on where it was interrupted, `evolution` moves candidates over thresholds,
-`levenberg_marquardt` takes the steps of a `descent`. Start with `search`.
+`levenberg_marquardt` makes the steps of a `descent`. Start with `search`.
 """

@@ -6,8 +6,8 @@ others: what comes out is to the last bit what the search would have found in on
 computed again, where they are needed.
 
 A fit makes several searches: each has its own list of stages, under a digest of all that it follows
-from. Of the profiles of a solution only the last stage is kept, which holds all before it. The file
-belongs to one fit, which its identity names; stages of another are not used.
+from. Of the profiles of a solution only the last stage is stored, which holds all before it. The
+file belongs to one fit, which its identity names; stages of another are not used.
 """
 
 import dataclasses
@@ -114,7 +114,7 @@ class Checkpoints:
         """Reads the stages that a killed process has left; logs why some cannot be used.
 
         Args:
-            folder: of the file; None keeps none.
+            folder: of the file; None writes none.
             name: of the file, which is written when a stage is finished.
             identity: of the fit. Stages of another one, or of another version of this program, are
                 not used.
@@ -160,7 +160,7 @@ class Checkpoints:
             restore: takes the profiles over, or raises one of `DAMAGES`.
 
         Returns:
-            What keeps the profiles, to be called after every stage.
+            A function that stores the profiles, to call after every stage.
         """
         if self._store.folder is None:
             return lambda stored: None
@@ -174,14 +174,14 @@ class Checkpoints:
                 )
                 del profiles[key]
 
-        def keep(stored: StoredProfiles) -> None:
+        def store(stored: StoredProfiles) -> None:
             profiles[key] = stored
             self._write()
 
-        return keep
+        return store
 
     def attach(self, search: Search, state: SearchState, starts: int) -> Search:
-        """The search with its stages recalled from here, and kept here."""
+        """The search with its stages recalled from here, and stored here."""
         if self._store.folder is None:
             return search
         first = (state.best.u.tolist(), state.random.bit_generator.state)
@@ -217,7 +217,7 @@ _current: ContextVar[Checkpoints | None] = ContextVar("current", default=None)
 
 
 def current() -> Checkpoints:
-    """The checkpoints that are entered; else some that keep nothing."""
+    """The checkpoints that are entered; else some that store nothing."""
     return _current.get() or Checkpoints(None, "", "")
 
 
@@ -290,7 +290,7 @@ def _restored(stored: StoredStage, before: SearchState) -> SearchState:
 
 
 def _check(stored: StoredStage, state: SearchState) -> None:
-    """Raises one of `DAMAGES` for a stage that is none of this search."""
+    """Raises one of `DAMAGES` for a stage of another search."""
     restored, size = _restored(stored, state), len(state.point.u)
     elite = np.empty((0, size)) if restored.elite is None else restored.elite.u
     if {len(restored.point.u), len(restored.best.u), elite.shape[-1]} != {size}:
@@ -298,7 +298,7 @@ def _check(stored: StoredStage, state: SearchState) -> None:
 
 
 def _point(stored: StoredPoint, before: SearchState) -> Point:
-    """The point; one that the search has met just now keeps its Jacobian."""
+    """The point, with its Jacobian where the search has met it just now."""
     u = np.array(stored["u"])
     for known in (before.best, before.point):
         if np.array_equal(u, known.u) and stored["cost"] == known.cost:

@@ -169,9 +169,8 @@ def vary(
 ) -> Candidates:
     """`u` of values of which some are shifted and some drawn anew from their range.
 
-    Values are kept, not `u`: a threshold that stays above another one would move with it, off the
-    plateau it had reached. Shifts are in the log-odds of the fraction of the range; 0 keeps a
-    value.
+    Values stay, not `u`: a threshold that stays above another one would move with it, off the
+    plateau it had reached. Shifts are in the log-odds of the fraction of the range.
     """
     low, high = np.asarray(space.low), np.asarray(space.high)
     fraction = np.clip((values - low) / (high - low), EDGE, 1 - EDGE)
@@ -311,7 +310,7 @@ def best_of_sweep(
 ) -> Point:
     """The best point when parameters take their values at these fractions of their ranges.
 
-    Each parameter in turn takes all the values while the others keep theirs. Then the best values
+    Each parameter in turn goes through all values while the others stay. Then the best values
     of the parameters are combined, best parameter first, as many of them as lower the cost most.
     """
     space = problem.space

@@ -59,7 +59,7 @@ def find_best_fit(
 ) -> Solution:
     """The free parameters of minimum cost.
 
-    KeyboardInterrupt (Ctrl-C) ends the search and keeps the best point so far, if there is one. The
+    KeyboardInterrupt (Ctrl-C) ends the search at the best point so far, if there is one. The
     solution's `converged` and `message` say how far to trust it. Where `Checkpoints` are entered,
     the search goes on after the stages that they have of it.
 

@@ -52,7 +52,7 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Report(Progress):
-    """A report with the best point so far, which the history does not keep."""
+    """A report with the best point so far, which the history leaves out."""
 
     best_u: Float[np.ndarray, " free"]
 

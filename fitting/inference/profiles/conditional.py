@@ -158,22 +158,23 @@ class Conditional:
         """
         base, owner = join(starts), np.repeat(np.arange(len(starts)), [len(s.cost) for s in starts])
         gradient = np.zeros_like(base.u)  # near their own optimum, the targets apart
-        found: Points | None = None
+        lowest: Points | None = None
         for _ in range(GENERATIONS):
             chosen, following, besides = self._choose(base.cost, owner, len(starts))
             here = targets[owner[chosen]]
             moved = self.move(base[chosen], gradient[chosen], here, following, besides)
             evaluated, slopes = self.evaluate(moved)
-            # What is kept is at its target: the starts are not.
-            kept = slice(0, 0) if found is None else slice(None)
-            base, gradient = join([base[kept], evaluated]), np.concatenate([gradient[kept], slopes])
-            owner = np.concatenate([owner[kept], owner[chosen]])
+            # The starts, which are not at their targets, do not compete with the candidates.
+            rivals = slice(0, 0) if lowest is None else slice(None)
+            base = join([base[rivals], evaluated])
+            gradient = np.concatenate([gradient[rivals], slopes])
+            owner = np.concatenate([owner[rivals], owner[chosen]])
             best = _lowest_of(base.cost, owner, len(starts))
             base, gradient, owner = base[best], gradient[best], owner[best]
-            found = base
-        assert found is not None
-        far = ~self._near(found.u) & np.isfinite(found.cost)
-        return self.descend_each(found, targets, far) if descending else found
+            lowest = base
+        assert lowest is not None
+        far = ~self._near(lowest.u) & np.isfinite(lowest.cost)
+        return self.descend_each(lowest, targets, far) if descending else lowest
 
     def _choose(
         self, cost: np.ndarray, owner: np.ndarray, targets: int

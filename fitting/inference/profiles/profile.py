@@ -22,7 +22,7 @@ from fitting.problem.space import EDGE, FreeParameter, from_fractions, to_fracti
 from .conditional import Points, Targets, join
 
 BARRIER = 2.0  # times that rise, at least, lies between two minima
-SEPARATION = 0.05  # fraction of the range, at least, likewise: hard decisions make small cliffs
+SEPARATION = 0.05  # fraction of the range between two minima, at least: hard decisions make cliffs
 
 Verdict = Literal["two-sided", "at least", "at most", "flat", "several valleys"]
 

@@ -2,8 +2,8 @@
 
 The whole range is scanned in batches. From the solution, each curve is then followed outwards in
 both directions as long as the data allow, and its lowest points elsewhere descend, so that minima
-are found. At last the ends of the intervals are refined. Whatever lies lower than the solution is
-kept: the best point goes back to the fit.
+are found. At last the ends of the intervals are refined. The best point that lies lower than the
+solution goes back to the fit.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from .profile import SAME_PLACE, Curves, crossing, low_parts
 CLOSE = 6.0  # rise of the cost up to which another plateau may matter
 GENERATIONS = 2  # of combinations of thresholds
 CHILDREN = 64  # in a generation
-PLATEAUS = 5  # kept, besides the solution's
+PLATEAUS = 5  # from which descents begin, besides the solution's
 SAME_PLATEAU = 0.01  # of the cost
 SMALLEST = 0.01  # move of a threshold in a round, a fraction of the largest
 SIZES = 6  # of these moves
@@ -54,13 +54,13 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
     """The best points on other plateaus of the thresholds, near in cost to the solution.
 
     The thresholds of children are drawn from those along the thresholds' curves, independently of
-    each other; what the curves say of single thresholds is so tried together.
+    each other.
     """
     space = conditional.problem.space
     thresholds = [int(i) for i in np.flatnonzero(space.thresholds)]
     random = np.random.default_rng(seed)
     along = {i: curves.curves[i][curves.rises(i) < CLOSE] for i in thresholds}
-    found = [along[i] for i in thresholds]
+    candidates = [along[i] for i in thresholds]
     for _ in range(GENERATIONS if len(thresholds) > 1 else 0):
         values = np.repeat(curves.best.values, CHILDREN, axis=0)
         for i in thresholds:
@@ -68,8 +68,8 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
         evaluated, gradient = conditional.evaluate(space.pack_values(values))
         here = Targets(np.full(len(values), thresholds[0]), values[:, thresholds[0]])
         everything = np.ones(evaluated.u.shape, bool)
-        found += [conditional.points(conditional.move(evaluated, gradient, here, everything))]
-    together = join(found)
+        candidates += [conditional.points(conditional.move(evaluated, gradient, here, everything))]
+    together = join(candidates)
     data_cost = together.cost - space.prior_costs(together.u)[:, thresholds].sum(axis=1)
     order = np.argsort(together.cost, kind="stable")
     order = order[together.cost[order] < curves.best.cost[0] + CLOSE]
@@ -208,7 +208,7 @@ class Profiling:
         if not all(len(curve.cost) and np.isfinite(curve.cost).all() for curve in curves):
             raise ValueError("a profile has a point without a cost, or no point")
         plateaus = _points(stored["plateaus"], size)
-        np.random.default_rng().bit_generator.state = stored["random"]  # raises where it is none
+        np.random.default_rng().bit_generator.state = stored["random"]  # raises for another state
         self.conditional.random.bit_generator.state = stored["random"]
         self.curves.curves, self.plateaus = curves, plateaus
         self.cliffs = {(int(i), place) for i, place in stored["cliffs"]}
@@ -235,7 +235,7 @@ def _points(stored: StoredPoints, size: int) -> Points:
 def find_curves(problem: Problem, solution: Solution) -> Curves:
     """The profiles' points around a solution of a problem."""
     profiling, current = Profiling.around(problem, solution), checkpoints.current()
-    keep = current.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
+    store = current.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
     try:
         title = f"Following {problem.space.size} parameters over their ranges"
         with activity.announced(title, len(STAGES)) as following:
@@ -244,7 +244,7 @@ def find_curves(problem: Problem, solution: Solution) -> Curves:
                 stage(profiling)
                 profiling.stages += 1
                 following.reach(profiling.stages)
-                keep(profiling.stored())
+                store(profiling.stored())
     finally:
         current.flush()
     return profiling.curves

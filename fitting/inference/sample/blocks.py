@@ -37,7 +37,7 @@ class BlockLogLikelihood:
     """Seconds from the beginning of the clip."""
     end: Float[np.ndarray, " blocks"]
     data: str
-    """Digest of the captured motion and of what of it counts."""
+    """Digest of the captured motion and of the frames that count."""
     efficiency: float
     """Effective draws for each draw."""
 
@@ -72,7 +72,7 @@ def is_available() -> bool:
 
 
 def to_tree(blocks: BlockLogLikelihood) -> Any:
-    """The log-likelihood alone, as ArviZ takes it: one chain, a `block` for each observation."""
+    """The log-likelihood alone, for ArviZ: one chain, a `block` for each observation."""
     from arviz_base import from_dict
 
     tree = from_dict(
@@ -118,15 +118,15 @@ def leave_one_out(blocks: BlockLogLikelihood) -> LeaveOneOut | None:
     from arviz_stats.loo import loo
 
     with warnings.catch_warnings(action="ignore"):  # of unreliable blocks, which are counted below
-        found: Any = loo(to_tree(blocks), pointwise=True, reff=blocks.efficiency)
-    elpd_of_block = np.asarray(found.elpd_i)
+        estimate: Any = loo(to_tree(blocks), pointwise=True, reff=blocks.efficiency)
+    elpd_of_block = np.asarray(estimate.elpd_i)
     return LeaveOneOut(
-        elpd=float(found.elpd),
-        error=float(found.se),
-        parameters=float(found.p),
+        elpd=float(estimate.elpd),
+        error=float(estimate.se),
+        parameters=float(estimate.p),
         elpd_of_block=elpd_of_block,
-        pareto_k=np.asarray(found.pareto_k),
-        max_k=float(found.good_k),
+        pareto_k=np.asarray(estimate.pareto_k),
+        max_k=float(estimate.good_k),
         neighbours=_neighbours(elpd_of_block, blocks.clip),
     )
 

@@ -117,7 +117,7 @@ def random_state(keys: Any, position: Any, has_gauss: Any, gauss: Any) -> Random
 
     Raises:
         ValueError: no generator has such a state.
-        TypeError: likewise.
+        TypeError: an entry is not a number.
     """
     keys = np.array(keys, np.uint32)
     state = "MT19937", keys, int(position), int(has_gauss), float(gauss)

@@ -85,7 +85,7 @@ def summarise(
 
     Args:
         names: of the parameters.
-        values: of the kept steps and walkers, in the parameters' units.
+        values: without burn-in and isolated walkers, in the parameters' units.
         times: autocorrelation times, in steps of `values`.
         r_hat: of the same steps.
     """

@@ -1,4 +1,4 @@
-"""A posterior as ArviZ's tools take it: for its plots, its diagnostics and NetCDF files.
+"""A posterior for ArviZ: its plots, its diagnostics and NetCDF files.
 
 ArviZ is optional; `pip install "jaxik[posterior]"` brings what is used here.
 """
@@ -62,15 +62,15 @@ def read_blocks(path: Path) -> blocks.BlockLogLikelihood:
 
 
 def to_inference_data(posterior: Posterior, space: Space) -> Any:
-    """The kept draws and draws of the prior as ArviZ's `DataTree` (`InferenceData` in its 0.x).
+    """Draws of posterior and prior as ArviZ's `DataTree` (`InferenceData` in its 0.x).
 
     Groups: `posterior` and `prior` hold a variable for each parameter under its dotted name, in its
     unit, with `units` and `kind` as attributes; `sample_stats` holds the log-probability as `lp`.
     `log_likelihood`, where the posterior has it, holds that of the captured `motion` for some draws
     and each `block` of frames, as `arviz_stats.loo` takes it; `clip`, `start` and `end` say which.
     Coordinates: `chain`, the walker's index, and `draw`, the step of the sampler, so that burn-in
-    and isolated walkers are seen to be missing. Walkers exchange proposals: ArviZ takes them for
-    independent chains, and its effective sample sizes are too large; ours are in the summary.
+    and isolated walkers are seen to be missing. Walkers exchange proposals, but ArviZ treats them
+    as independent chains: its effective sample sizes are too large; ours are in the summary.
 
     Args:
         posterior: the samples.

@@ -167,10 +167,10 @@ def survey(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
 ) -> tuple[Mode, ...]:
     """The modes in which walkers are, the heaviest first; none where there is only one."""
-    found = find_modes(u)
-    if len(found) == 1:
+    mixture = find_modes(u)
+    if len(mixture) == 1:
         return ()
-    labels = found.labels(u)
+    labels = mixture.labels(u)
     changes = labels[1:] != labels[:-1]
     modes = []
     for label in np.unique(labels):

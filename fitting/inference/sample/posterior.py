@@ -114,7 +114,7 @@ class Posterior(Shown):
 
     @property
     def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
-        """`u` of the values that are kept."""
+        """`u` of the same draws."""
         return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
 
     @property
@@ -133,7 +133,7 @@ class Posterior(Shown):
         return dict(zip(self.names, self.values[best].tolist(), strict=True))
 
     def to_inference_data(self, space: Space) -> Any:
-        """The kept draws as ArviZ takes them; see `inference_data.to_inference_data`."""
+        """The draws after burn-in for ArviZ; see `inference_data.to_inference_data`."""
         from .inference_data import to_inference_data
 
         return to_inference_data(self, space)
@@ -148,7 +148,7 @@ class Posterior(Shown):
 
     @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
-        """One row per parameter, of the values that are kept."""
+        """One row per parameter, without burn-in and isolated walkers."""
         times = self.autocorrelation_time / self.thin_by
         return diagnostics.summarise(
             self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(self.kept_u)
@@ -168,7 +168,7 @@ def sample_posterior(
 
     A run that was killed continues from its file when called again with the same arguments, and its
     chain is bit by bit the one that an uninterrupted run makes. A finished one is returned as it
-    is; a larger `max_steps` or `stop_at` continues it. KeyboardInterrupt keeps the chain and
+    is; a larger `max_steps` or `stop_at` continues it. KeyboardInterrupt saves the chain and
     returns it, unless no step is done.
 
     Args:
@@ -176,7 +176,7 @@ def sample_posterior(
         start: where the walkers start.
         settings: how long to sample.
         seed: of the start and of every proposal.
-        path: HDF5 file for the chain, in the layout of emcee; None keeps it in memory only.
+        path: HDF5 file for the chain, in the layout of emcee; None leaves it in memory.
 
     Raises:
         ValueError: for shapes, numbers of walkers or widths that are impossible, a start where too
@@ -255,7 +255,7 @@ def _extend(
     assert latest is not None  # at least one length is checked
     converged, message = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
     if interrupted:
-        converged, message = False, f"Interrupted, the chain is kept. {message}"
+        converged, message = False, f"Interrupted, the chain is saved. {message}"
     return _Outcome(latest, converged, message, interrupted)
 
 

@@ -47,9 +47,11 @@ def prior_sensitivity(posterior: Posterior, prior: Prior) -> dict[str, list[Rewe
     The spread in `u` of its own prior changes; a uniform prior becomes a logistic one of half or
     twice the scale, denser in the middle of the range or at its bounds.
     """
-    kept = posterior.kept_u.reshape(-1, len(posterior.names))
-    every = max(1, len(kept) // DRAWS)
-    u, values = kept[::every], posterior.kept.reshape(kept.shape)[::every]
+    every = max(1, posterior.kept[..., 0].size // DRAWS)
+    u, values = (
+        draws.reshape(-1, len(posterior.names))[::every]
+        for draws in (posterior.kept_u, posterior.kept)
+    )
     ess = np.array([row["ess"] for row in posterior.summary])
     present = np.asarray(prior.residuals(jnp.asarray(u)))
     result: dict[str, list[Reweighted]] = {name: [] for name in posterior.names}

@@ -362,5 +362,5 @@ def test_a_threshold_that_varies_and_a_start_without_finite_residuals_are_refuse
     with pytest.raises(ValueError, match=r"start is a threshold: .* leave it shared"):
         fitted([whole, other], per_clip(2, 2))
     broken = Problem(space, (jnp.full_like(other.data[0], jnp.inf),), residuals)
-    with pytest.raises(ValueError, match="not finite where the hierarchy begins"):
+    with pytest.raises(ValueError, match="not finite where the mixed model begins"):
         fitted([whole, broken], per_clip(2, 1))
