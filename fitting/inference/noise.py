@@ -192,13 +192,6 @@ def whitened(errors: Errors, correlation: float) -> Errors:
     return errors._replace(values=np.where(follows, innovation, values))
 
 
-def influence(
-    residuals: Float[np.ndarray, "*values"], loss: Loss, tails: float
-) -> Float[np.ndarray, "*values"]:
-    """Derivative of half the loss by a residual, both in sigmas."""
-    return residuals * slope_of_rho(residuals**2, loss, tails, np)
-
-
 def scale(values: Float[np.ndarray, " values"], loss: Loss, tails: float) -> float:
     """The likeliest sigma of independent values: `sigma² = mean(weight * value²)`.
 
@@ -418,7 +411,8 @@ def likelihood_weight(
 
 
 def _influence(problem: Problem[jaxik.FootIK], residuals: np.ndarray) -> np.ndarray:
-    return influence(residuals, problem.loss, float(problem.tails))
+    """Derivative of half the loss by a residual, both in sigmas."""
+    return residuals * slope_of_rho(residuals**2, problem.loss, float(problem.tails), np)
 
 
 def _errors_of_clips(problem: Problem[jaxik.FootIK], u: Vector) -> list[dict[str, Errors]]:

@@ -1,7 +1,7 @@
 """A problem of many clips whose residuals are computed on all devices, each with its clips.
 
 The clips lie on the devices and stay there; the parameters go to all of them, and one number comes
-back for each point, the sum of what all devices found. It is that of one device up to rounding.
+back for each point, the sum over all devices. It is that of one device up to rounding.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ def over_devices(
 
     Args:
         problem: of clips, as `problem_from_clips` makes it.
-        devices: those of JAX; None takes all of this process.
+        devices: those of JAX; None stands for all of this process.
     """
     devices = jax.local_devices() if devices is None else list(devices)
     if (
@@ -89,7 +89,7 @@ def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, 
         of_clips = jax.vmap(
             residuals_of_scene, in_axes=(None, shared_world.labelled(scenes, stacked, 0))
         )
-        spread = specifications(scenes, stacked, SPLIT)
+        spread = shared_world.labelled(scenes, stacked, SPLIT, EVERYWHERE)
         # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
         of_devices = jax.shard_map(
             of_clips,
@@ -115,12 +115,6 @@ def _filled(stack: shared_world.Stack, devices: int) -> shared_world.Stack:
     return stack._replace(scenes=scenes, members=(*stack.members, *[-1] * (whole - count)))
 
 
-def specifications(tree: PyTree, stacked: Sequence[bool], split: PartitionSpec) -> PyTree:
-    """How the arrays of a tree are split among devices: those that are not stacked are copied."""
-    leaves = [split if flag else EVERYWHERE for flag in stacked]
-    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
-
-
 def _on_all(tree: Tree, mesh: Mesh) -> Tree:
     """The tree with a copy of each array on every device, wherever it was before."""
     everywhere = NamedSharding(mesh, EVERYWHERE)
@@ -131,9 +125,6 @@ def _on_all(tree: Tree, mesh: Mesh) -> Tree:
 
 def _placed(stack: shared_world.Stack, mesh: Mesh) -> Scene:
     """The stack's arrays on their devices."""
-    leaves, structure = jax.tree.flatten(stack.scenes)
-    placed = [
-        jax.device_put(leaf, NamedSharding(mesh, SPLIT if flag else EVERYWHERE))
-        for leaf, flag in zip(leaves, stack.stacked, strict=True)
-    ]
-    return jax.tree.unflatten(structure, placed)
+    split, everywhere = NamedSharding(mesh, SPLIT), NamedSharding(mesh, EVERYWHERE)
+    shardings = shared_world.labelled(stack.scenes, stack.stacked, split, everywhere)
+    return jax.device_put(stack.scenes, shardings)

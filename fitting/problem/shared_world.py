@@ -356,9 +356,9 @@ def chosen(tree: StackedTree, stacked: Sequence[bool], numbers: int | np.ndarray
     return jax.tree.unflatten(structure, [x[numbers] if flag else x for x, flag in pairs])
 
 
-def labelled(tree: PyTree, stacked: Sequence[bool], label: object) -> PyTree:
-    """The tree with a label for each stacked array and None for others, as axes are given."""
-    leaves = [label if flag else None for flag in stacked]
+def labelled(tree: PyTree, stacked: Sequence[bool], label: object, other: object = None) -> PyTree:
+    """The tree with a label for each stacked array and another for others: axes or shardings."""
+    leaves = [label if flag else other for flag in stacked]
     return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
 

@@ -145,7 +145,7 @@ def valley(ik: Fractions, data: jax.Array) -> jax.Array:
 
 
 def march(
-    model: levenberg_marquardt.Model, u: jax.Array, steps: int
+    model: levenberg_marquardt.HardModel, u: jax.Array, steps: int
 ) -> list[levenberg_marquardt.LMState]:
     """The states before and after each of our steps."""
     states = [levenberg_marquardt.begin(model, u)]

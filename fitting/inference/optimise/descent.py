@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from . import levenberg_marquardt
 from .levenberg_marquardt import HardModel, LMState, problem_jacobian
-from .solution import Point, Search, SearchSettings, SearchState
+from .solution import Point, Search, SearchState
 
 
 def descend(search: Search, state: SearchState, stage: str) -> SearchState:
@@ -35,12 +35,16 @@ def _descend(
     if lm is None or not np.array_equal(u, lm.u):
         lm = levenberg_marquardt.evaluate(model, u)
     state = dataclasses.replace(state, point=point_of(lm))
-    streaks = Streaks()
+    small = rejected = 0  # steps in a row: accepted with next to no gain, and rejected
     for _ in range(max_steps):
         state = search.spend_step(state)
-        before, lm = lm, levenberg_marquardt.step(model, lm)
-        streaks = streaks.after(before, lm, search.settings)
-        finished = streaks.finished(search.settings, max_rejected)
+        before, lm = np.asarray(lm.cost), levenberg_marquardt.step(model, lm)
+        if lm.accepted:
+            is_small = before - np.asarray(lm.cost) <= search.settings.min_step_gain * before
+            small, rejected = small + 1 if is_small else 0, 0
+        else:
+            rejected += 1
+        finished = small >= search.settings.max_small_steps or rejected >= max_rejected
         converged = stage == "polish" and finished
         state = search.move(state, stage, point_of(lm), converged=converged)
         if finished:
@@ -57,30 +61,9 @@ def point_of(lm: LMState) -> Point:
 
 
 def jacobian_at(search: Search, point: Point) -> Float[np.ndarray, "residuals free"]:
-    """Of the problem's residuals; a point of a population, or of a file, comes without one."""
+    """Of the problem's residuals; a candidate, or a point of a file, comes without one."""
     if point.jacobian is not None:
         return point.jacobian
     u = search.array(point.u)
     evaluated = levenberg_marquardt.evaluate(HardModel(search.problem, u), u)
     return problem_jacobian(evaluated.jacobian)
-
-
-@dataclasses.dataclass(frozen=True)
-class Streaks:
-    """Steps in a row without progress."""
-
-    small: int = 0
-    """Accepted, but with next to no gain."""
-    rejected: int = 0
-
-    def after(self, before: LMState, after: LMState, settings: SearchSettings) -> "Streaks":
-        """The streaks after one more step."""
-        if not after.accepted:
-            return Streaks(self.small, self.rejected + 1)
-        cost = np.asarray(before.cost)
-        small = cost - np.asarray(after.cost) <= settings.min_step_gain * cost
-        return Streaks(self.small + 1 if small else 0)
-
-    def finished(self, settings: SearchSettings, max_rejected: int) -> bool:
-        """Whether further steps are not worth it."""
-        return self.small >= settings.max_small_steps or self.rejected >= max_rejected

@@ -5,7 +5,6 @@ accepts or rejects the point where it leads, and gives the size of the next one.
 """
 
 import functools
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,17 +21,6 @@ BLOCK = 128  # rows of a QR decomposition that fit into a core's cache
 
 DESCENT: optx.AbstractDescent = optx.DampedNewtonDescent()
 SEARCH: optx.AbstractSearch = optx.ClassicalTrustRegion()
-
-
-@runtime_checkable
-class Model(Protocol):
-    """A least-squares problem: residuals and their derivatives at a point."""
-
-    def residuals_and_jacobian(
-        self, u: Float[Array, " free"], max_cost: Float[Array, ""]
-    ) -> tuple[Float[Array, " residuals"], Float[Array, "residuals free"]]:
-        """Both at `u`; the Jacobian may be 0 where the cost exceeds `max_cost`."""
-        ...
 
 
 class HardModel(eqx.Module):
@@ -88,8 +76,8 @@ class Compressed(eqx.Module):
 
 
 @eqx.filter_jit  # traced once for all programs around it
-def compress(model: Model, u: Float[Array, " free"], max_cost: Float[Array, ""]) -> Compressed:
-    """A model's residuals and Jacobian at `u`, as few rows."""
+def compress(model: HardModel, u: Float[Array, " free"], max_cost: Float[Array, ""]) -> Compressed:
+    """Residuals and Jacobian at `u`, as few rows."""
     residuals, jacobian = model.residuals_and_jacobian(u, max_cost)
     triangle = triangular_factor(jnp.concatenate([jacobian, residuals[:, None]], axis=1))
     return Compressed(triangle[:, -1], triangle[:, :-1], jacobian)
@@ -143,7 +131,7 @@ class LMState(eqx.Module):
 
 
 @cached
-def begin(model: Model, u: Float[Array, " free"]) -> LMState:
+def begin(model: HardModel, u: Float[Array, " free"]) -> LMState:
     """The state of a descent before anything is evaluated."""
     infinite, no = jnp.asarray(jnp.inf, u.dtype), jnp.zeros((), bool)
     shapes = eqx.filter_eval_shape(compress, model, u, infinite)
@@ -154,7 +142,7 @@ def begin(model: Model, u: Float[Array, " free"]) -> LMState:
 
 
 @cached
-def step(model: Model, state: LMState) -> LMState:
+def step(model: HardModel, state: LMState) -> LMState:
     """One step of Levenberg–Marquardt; the first only evaluates the point where it stands."""
     # A trial that does not lower the cost is rejected, and its Jacobian is never used.
     at_trial = compress(model, state.trial, state.cost)
@@ -186,11 +174,11 @@ def step(model: Model, state: LMState) -> LMState:
 
 
 def _function_info(compressed: Compressed) -> optx.FunctionInfo:
-    """A model at a point, as optimistix takes it."""
+    """A model at a point, as optimistix has it."""
     jacobian = lx.MatrixLinearOperator(compressed.jacobian)
     return optx.FunctionInfo.ResidualJac(compressed.residuals, jacobian)
 
 
-def evaluate(model: Model, u: Float[Array, " free"]) -> LMState:
+def evaluate(model: HardModel, u: Float[Array, " free"]) -> LMState:
     """The beginning of a descent, with cost and Jacobian at `u`."""
     return step(model, begin(model, u))

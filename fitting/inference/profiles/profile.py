@@ -278,13 +278,7 @@ def max_rise(
     values: Float[np.ndarray, " points"],
     rises: Float[np.ndarray, " points"],
 ) -> float:
-    """Rise of the cost within a 95 % interval of a profile through these points.
-
-    Args:
-        parameter: whose profile it is.
-        values: of the parameter, rising.
-        rises: of the cost, prior included.
-    """
+    """Rise of the cost within a 95 % interval of the profile through points, values rising."""
     usual = usual_rise(parameter)
     cells, mass = _density(parameter, values, rises)
     if not len(cells):
@@ -300,14 +294,7 @@ def level_of(
     rises: Float[np.ndarray, " points"],
     rise: float,
 ) -> float:
-    """Level, 0..1, of the interval of a smooth parameter whose ends rise as far as this.
-
-    Args:
-        parameter: whose profile it is.
-        values: of the parameter, rising.
-        rises: of the cost, prior included.
-        rise: at the ends of the interval.
-    """
+    """Level, 0..1, of the interval of a smooth parameter at whose ends the cost has this rise."""
     cells, mass = _density(parameter, values, rises)
     by_mass = float(mass[cells <= rise].sum() / mass.sum()) if len(cells) else 1.0
     return min(float(chdtr(1, 2 * rise)), by_mass)

@@ -71,7 +71,6 @@ def write_chain(path: Path, identity: Identity, chain: StoredChain) -> None:
     Raises:
         ValueError: the file cannot be written.
     """
-
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         _write(file.create_group(GROUP), identity, chain)
         file.flush()
@@ -219,7 +218,9 @@ class Chain:
         if path is None:
             return
         if path.exists():
-            self._read_file(path)
+            stored = read_chain(path, identity)
+            self.accepted, self._random_state = stored.accepted, stored.random_state
+            self._u, self._log_probability = list(stored.u), list(stored.log_probability)
             self._saved = len(self)
             self._read_journal(journal_path(path))
         else:
@@ -259,14 +260,8 @@ class Chain:
     ) -> None:
         """Stores one step; once it returns, a kill of this process cannot lose it."""
         if self._journal is not None:
-            record = np.zeros((), _record(self.identity))
-            record["token"] = self.identity.token
-            record["step"] = len(self)
-            record["u"] = u
-            record["log_probability"] = log_probability
-            record["accepted"] = accepted
-            for name, part in zip(RANDOM_STATE_FIELDS, random_state[1:], strict=True):
-                record[name] = part
+            head = self.identity.token, len(self), u, log_probability, accepted
+            record = np.array((*head, *random_state[1:], 0), _record(self.identity))
             record["checksum"] = _checksum(record)
             self._write_record(record.tobytes())
         self._remember(u, log_probability, accepted, random_state)
@@ -318,13 +313,6 @@ class Chain:
         except OSError as error:
             problem = in_one_line(error)
         raise ValueError(f"{journal_path(self.path)}: cannot be written: {problem}")
-
-    def _read_file(self, path: Path) -> None:
-        stored = read_chain(path, self.identity)
-        self.accepted = stored.accepted
-        self._u = list(stored.u)
-        self._log_probability = list(stored.log_probability)
-        self._random_state = stored.random_state
 
     def _read_journal(self, path: Path) -> None:
         """Adds the records that continue the chain, up to the first that is torn."""

@@ -32,7 +32,6 @@ def is_available() -> bool:
     return all(importlib.util.find_spec(package) for package in PACKAGES)
 
 
-@in_float64
 def _check_available() -> None:
     if not is_available():
         raise ImportError('this needs ArviZ: pip install "jaxik[posterior]"')
@@ -61,6 +60,7 @@ def read_blocks(path: Path) -> blocks.BlockLogLikelihood:
     return stored
 
 
+@in_float64
 def to_inference_data(posterior: Posterior, space: Space) -> Any:
     """Draws of posterior and prior as ArviZ's `DataTree` (`InferenceData` in its 0.x).
 

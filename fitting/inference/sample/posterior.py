@@ -313,12 +313,6 @@ def _progress(
     )
 
 
-def _values(
-    space: Space, u: Float[np.ndarray, "steps walkers free"]
-) -> Float[np.ndarray, "steps walkers free"]:
-    return np.asarray(space.values(u))
-
-
 def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float) -> Posterior:
     u, check = chain.u, outcome.check
     acceptance = chain.accepted / len(chain)
@@ -327,7 +321,7 @@ def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float
         names=problem.space.names,
         u=u,
         log_probability=chain.log_probability,
-        values=_values(problem.space, u),
+        values=problem.space.values(u),
         thin_by=chain.identity.thin_by,
         burn_in=check.burn_in,
         autocorrelation_time=check.times * chain.identity.thin_by,

@@ -23,7 +23,7 @@ import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
-from fitting.inference.sharding import EVERYWHERE, specifications
+from fitting.inference.sharding import EVERYWHERE
 from fitting.problem import shared_world
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene
@@ -235,7 +235,8 @@ def _along(
     in_axes = tuple(flags and shared_world.labelled(tree, flags, 0) for tree, flags in arguments)
     split = PartitionSpec(BATCH)
     specs = tuple(
-        specifications(tree, flags, split) if flags else EVERYWHERE for tree, flags in arguments
+        shared_world.labelled(tree, flags, split, EVERYWHERE) if flags else EVERYWHERE
+        for tree, flags in arguments
     )
 
     def of_one(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
