@@ -6,6 +6,6 @@ posterior is sampled (`fitting.inference`), nor of files (`fitting.experiment`).
 
 Start with `problem`, which also has the robust losses. `space` describes the parameters and what is
 known of them before any data. `scene` and `residuals` are the data of foot IK, `capture_system`
-what is not known of a capture. `shared_world` runs several clips in a row or side by side, and
+the errors of a capture. `shared_world` runs several clips in a row or side by side, and
 `simulation` makes data whose truth is known.
 """

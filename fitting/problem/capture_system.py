@@ -1,10 +1,10 @@
-"""A system together with what is not known of the captures that it is fitted to.
+"""A system together with the errors of the captures that it is fitted to.
 
 Ground may be higher than its file says, or tilted. A ray along -up keeps its place seen from above,
 so it meets raised ground where a ray that starts as much lower meets the ground as it is: no mesh
 is built anew, nor moved for each parameter.
 
-A residual is what the capture would show of the motion minus what it shows. The other way round,
+A residual is the motion as the capture would record it, minus the capture. The other way round,
 captured motion that is corrected, and so interpolated and scaled, would have less noise for some
 numbers than for others, and the fit would choose those.
 """
@@ -30,7 +30,7 @@ from .problem import Problem
 from .scene import GROUND, Capture, Scene
 from .space import Vector
 
-PREFIX = "capture."  # of the names of what is not a parameter of the system
+PREFIX = "capture."  # of the names of errors of the capture
 
 
 class CapturedSystem(jaxik.FootIK):
@@ -39,7 +39,7 @@ class CapturedSystem(jaxik.FootIK):
     capture: Capture = eqx.field(default_factory=Capture)
     """Of all clips, (clips)."""
     moves_ground: bool = eqx.field(static=True, default=False)
-    """Whether anything of the ground is fitted: else rays are as without a capture."""
+    """Whether errors of the ground are fitted: else rays are as without a capture."""
 
     @property
     def alone(self) -> jaxik.FootIK:
@@ -49,7 +49,7 @@ class CapturedSystem(jaxik.FootIK):
 
 
 def with_capture(ik: jaxik.FootIK, clips: int, names: Sequence[str]) -> CapturedSystem:
-    """A system with a capture of which all is as it seems.
+    """A system with a capture without errors.
 
     Args:
         ik: the system.
@@ -72,16 +72,16 @@ def alone(ik: jaxik.FootIK) -> jaxik.FootIK:
 
 
 def parted(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> tuple[jaxik.FootIK, tuple[Scene, ...]]:
-    """The system itself, and the clips as the capture beside it takes them."""
+    """The system itself, and the clips with the capture beside it."""
     if not isinstance(ik, CapturedSystem):
         return ik, scenes
     return ik.alone, tuple(
-        _as_captured(scene, ik.capture.of_clip(number), moves_ground=ik.moves_ground)
+        _with_capture(scene, ik.capture.of_clip(number), moves_ground=ik.moves_ground)
         for number, scene in enumerate(scenes)
     )
 
 
-def _as_captured(scene: Scene, capture: Capture, *, moves_ground: bool) -> Scene:
+def _with_capture(scene: Scene, capture: Capture, *, moves_ground: bool) -> Scene:
     scene = dataclasses.replace(scene, capture=capture)
     if not moves_ground:
         return scene
@@ -95,7 +95,7 @@ def _as_captured(scene: Scene, capture: Capture, *, moves_ground: bool) -> Scene
 def system_and_scenes(
     problem: Problem[jaxik.FootIK], u: Vector
 ) -> tuple[jaxik.FootIK, tuple[Scene, ...]]:
-    """The system at a point, and the clips of the problem as its capture takes them there."""
+    """The system at a point, and the clips of the problem with its capture there."""
     return parted(problem.space.unpack(u), problem.data)
 
 
@@ -118,10 +118,10 @@ def without_ends(scene: Scene, seconds: float) -> Scene:
     )
 
 
-def shown(
+def recorded(
     capture: Capture, rig: jaxik.Rig, frames: jaxik.Frame, legs: jaxik.LegPose, pelvis: Transform
 ) -> tuple[jaxik.LegPose, Transform]:
-    """Legs, of which knee and ankle count, and pelvis as the capture of a clip would show them.
+    """Legs, of which knee and ankle count, and pelvis as the capture of a clip would record them.
 
     Args:
         capture: of the clip.
@@ -179,7 +179,7 @@ def delayed(
     """Numbers of each frame as they were the capture's time shift before.
 
     Cubic between frames (Catmull and Rom 1974), so that derivatives have no jumps; what was before
-    a clip or comes after it is taken to be as at its end.
+    a clip or comes after it counts as at its end.
     """
     places, weights = _taps(capture, frames)
     return _mixed([values[place] for place in places], weights)

@@ -30,7 +30,7 @@ from jaxik import lanes
 from .space import Space, System, Vector
 
 HUBER = 1.345  # sigmas; 95 % efficient for normal errors (Holland and Welsch 1977)
-CAUCHY = 2.385  # sigmas, likewise
+CAUCHY = 2.385  # sigmas; 95 % efficient, too
 
 TAILS = 4.0  # degrees of freedom of Student's t, where none are estimated
 
@@ -75,7 +75,7 @@ def slope_of_rho(
 def _factor_and_slope(
     z: Any, loss: Loss, tails: Number, library: ModuleType
 ) -> tuple[Squares, Squares]:
-    """`rho(z) / z`, finite at 0, and the derivative of `rho`: all that tells losses apart."""
+    """`rho(z) / z`, finite at 0, and the derivative of `rho`: all in which losses differ."""
     match loss:
         case "squares":
             return library.ones_like(z), library.ones_like(z)
@@ -152,8 +152,8 @@ class Problem(eqx.Module, Generic[System]):
         """Derivatives of the residuals, by forward mode.
 
         The column of a threshold holds only its prior: the residuals jump with it, and between two
-        jumps they do not change. Not `jax.jacfwd`, which took the wrong branch of a minimum in a
-        program of the pipeline's size.
+        jumps they do not change. Not `jax.jacfwd`, which followed the wrong branch of a minimum in
+        a program of the pipeline's size.
         """
         return self.residuals_and_jacobian(u)[1]
 

@@ -78,7 +78,7 @@ def errors_of_pose(scene: Scene, legs: jaxik.LegPose, pelvis: Transform) -> dict
     """
     reference, present = scene.reference, scene.rig.present[..., None]
     if scene.capture is not None:
-        legs, pelvis = capture_system.shown(scene.capture, scene.rig, scene.frames, legs, pelvis)
+        legs, pelvis = capture_system.recorded(scene.capture, scene.rig, scene.frames, legs, pelvis)
     return {
         "ankle": (legs.ankle.pos - reference.ankle.pos) * present,
         "knee": (legs.knee.pos - reference.knee_ws) * present,

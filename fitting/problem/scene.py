@@ -1,8 +1,8 @@
 """The data of one clip: the animation a system runs on, and the motion it should reproduce.
 
-What is not known of a capture (where its ground is, when it begins, where its joints are) belongs
-to no system. Left out of a fit, it pulls the system's parameters to wherever they make up for it;
-fitted with a narrow prior, it takes its share, and intervals say what is left.
+Errors of a capture (where its ground is, when it begins, where its joints are) belong to no system.
+Left out of a fit, they pull the system's parameters to wherever these make up for them; fitted with
+narrow priors, they have a share of the residuals, and intervals contain the rest.
 """
 
 # pyright: reportInvalidTypeVarUse=false
@@ -30,7 +30,7 @@ LEAST_SIGMAS = {"ankle": 1e-3, "knee": 1e-3, "pelvis": 1e-3, "foot": 0.00175, "b
 
 
 def nuisance(default: float, *, unit: str, reach: float, doc: str) -> Declared:
-    """Declares a number of a capture, which stays within `reach` of its default.
+    """Declares an error of a capture, which stays within `reach` of its default.
 
     The standard deviation of its prior is a quarter of that.
     """
@@ -39,7 +39,7 @@ def nuisance(default: float, *, unit: str, reach: float, doc: str) -> Declared:
 
 
 class Capture(Rule):
-    """What is not known of a capture: numbers of one clip, or of several, (clips).
+    """Errors of a capture: numbers of one clip, or of several, (clips).
 
     Offsets are those of the captured joint from the one of the system's leg, along the axes of the
     foot; both feet of a character share them.
@@ -164,9 +164,9 @@ class Scene(eqx.Module):
     """Parameters that change along the clip, (frames, ...) by dotted name."""
     size: Float[Array, ""] | None = None
     """Leg length over that of the body for which systems are meant; they become `similar`. None
-    takes them as they are."""
+    leaves them as they are."""
     capture: Capture | None = None
-    """What is not as it seems in the clip; None of a clip of which all is."""
+    """Errors of the capture; None where it counts as exact."""
     place: Place | None = None
     """In a world shared with other scenes, with which it then runs in one loop; None runs alone."""
 

@@ -1,10 +1,10 @@
 """Clips that share one world: run one after another or side by side, they need one program.
 
-Compiling takes most of the time of a fit, and with each clip its own, it would grow with their
+Compiling takes most of the time of a fit, and with a program for each clip would grow with their
 number. So the terrains of all clips are put side by side into one mesh, far enough apart that no
 ray of a clip meets the ground of another, and all frames go through one loop, in which memory
 starts anew at the first frame of each clip. Foot IK is the same wherever a world has its origin.
-Terrains that are no static meshes can be shared only by clips that have the same one.
+Terrains that are not static meshes can be shared only by clips that have the same one.
 
 Side by side, clips of different length are one array. A clip is made longer by repeating its last
 frame, which then was not observed: nothing that a frame shows depends on later ones, and what was
@@ -73,7 +73,7 @@ def share_world(scenes: Sequence[Scene], probe: AbstractProbe) -> list[Scene]:
 
 
 class Row(NamedTuple):
-    """What a system runs on: one clip, or several that share a world, one after another."""
+    """The inputs of a system: one clip, or several that share a world, one after another."""
 
     ik: jaxik.FootIK
     rig: jaxik.Rig
@@ -94,12 +94,12 @@ def row_of(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> Row:
 
 
 def run_scene(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
-    """What a system makes of the clip of one scene, in its own world."""
+    """The result of a system on the clip of one scene, in its own world."""
     return run_row(ik, [scene])
 
 
 def run_scenes(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result, ...]:
-    """What a system makes of the clip of each scene: one loop for those that share a world."""
+    """The result of a system on the clip of each scene: one loop for those that share a world."""
     results: dict[int, Result] = {}
     for numbers in groups(scenes):
         members = [scenes[number] for number in numbers]
@@ -112,7 +112,7 @@ def run_scenes(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result,
 
 
 def run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> jaxik.Result:
-    """What a system makes of one scene, or of several in a row, in the world that they share."""
+    """The result of a system on one scene, or several in a row, in the world that they share."""
     row = row_of(ik, scenes)
     # Clips are checked when they are loaded.
     return jaxik.run(
@@ -164,12 +164,12 @@ def in_a_row(trees: Sequence[Tree]) -> Tree:
 
 
 def split(tree: Tree, scenes: Sequence[Scene], length: int | None = None) -> list[Tree]:
-    """What was computed for the frames of these scenes in a row, scene by scene.
+    """Arrays over the frames of these scenes in a row, scene by scene.
 
     Args:
         tree: of arrays along the frames.
         scenes: in this order.
-        length: of these arrays, where frames at both ends of a clip have nothing of their own.
+        length: of these arrays, where frames at both ends of a clip have no value.
     """
     counts = [len(scene.frames.dt) for scene in scenes]
     ends = np.cumsum(counts)
@@ -181,7 +181,7 @@ def split(tree: Tree, scenes: Sequence[Scene], length: int | None = None) -> lis
 
 
 def moved_out(tree: Tree, scene: Scene) -> Tree:
-    """What has places in the world of a scene, moved to where the scene is in the shared one."""
+    """Places in the world of a scene, moved to where the scene is in the shared one."""
     return tree if scene.place is None else _moved(tree, scene, scene.place.offset_ws)
 
 
@@ -427,7 +427,7 @@ def _with_terrain(scene: Scene, terrain: PyTree) -> Scene:
 
 
 def _without_names(scene: Scene) -> Scene:
-    """The clip without what only people read, which would keep it apart from others."""
+    """The clip without names and labels, which would separate it from others."""
     rig, reference = scene.rig, scene.reference
     legs = len(rig.names)
     names, joints = tuple(f"{i}" for i in range(legs)), ((0, 0, 0, 0),) * legs

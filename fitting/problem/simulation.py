@@ -33,7 +33,7 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     """The same problem with references that the system at `u` makes, plus the noise assumed.
 
     The noise is normal and has the scenes' sigmas and correlation; kinds with an infinite sigma
-    get none. A weight below 1 is taken for the fraction of the residuals that are independent: they
+    get none. A weight below 1 counts as the fraction of the residuals that are independent: they
     are correlated so that `(1 - rho) / (1 + rho)` of a first-order autoregression is. Frames that
     were not observed stay so. With a robust loss the noise has no outliers.
 
@@ -91,7 +91,7 @@ def _simulated(
     if np.isfinite(sigmas.smooth):
         raise ValueError(
             f"sigmas.smooth is {float(sigmas.smooth):g}: residuals of accelerations follow from "
-            "those of the ankles, so there is no noise to simulate; wanted inf"
+            "those of the ankles and have no noise of their own; wanted inf"
         )
 
     def noise(kind: str, shape: tuple[int, ...]) -> Noise:
@@ -112,7 +112,7 @@ def _simulated(
 
 @cached
 def _motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Motion]:
-    """What captures would show of what a system makes of each clip."""
+    """The motion of a system on each clip, as a capture would record it."""
     motions = []
     for scene, result in zip(scenes, run_scenes(ik, scenes), strict=True):
         motions.append(_motion(scene, result))
@@ -125,7 +125,7 @@ def _motion(scene: Scene, result: jaxik.Result) -> Motion:
     legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
     contact = result.trace.sensed.contact.weight
     if (capture := scene.capture) is not None:
-        legs, pelvis = capture_system.shown(capture, scene.rig, scene.frames, legs, pelvis)
+        legs, pelvis = capture_system.recorded(capture, scene.rig, scene.frames, legs, pelvis)
         contact = capture_system.delayed(capture, scene.frames, contact)
     return pelvis, legs.knee.pos, legs.ankle, contact
 

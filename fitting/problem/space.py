@@ -14,7 +14,7 @@ value: the order holds for every `u`. `start` is where a search begins.
     normal     log density = -½ ((u - centre) / spread)²          up to a constant
     uniform    log density = -2 log cosh(u / 2)                   up to a constant
 
-Both it and `start` are at the values of the system as it is, unless told otherwise. A value in the
+Both it and `start` are at the system's values, unless specified otherwise. A value in the
 outer sixth of its range often means that something is off, and not how it is when it is on: such a
 prior is centred a sixth inside. The uniform prior is the logistic distribution, whose image under
 the sigmoid is uniform: the value is anywhere in its range with equal density, on the parameter's
@@ -58,7 +58,7 @@ SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
 LOGISTIC_SD = math.pi / math.sqrt(3)  # of the logistic distribution
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
-CENTRE_LIMIT = 3.0  # of u, for given centres and for starts: at a bound u is infinite
+CENTRE_LIMIT = 3.0  # of u, for centres that a user sets and for starts: at a bound u is infinite
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
 INTERVAL = (0.025, 0.975)  # the probabilities at the ends of a 95 % interval
 SILENT = np.errstate(all="ignore")  # NumPy about NaN and infinity, as programs are
@@ -73,7 +73,7 @@ MIXTURE = 200  # draws of the others, where a parameter stays above another free
 
 @dataclasses.dataclass(frozen=True)
 class Override:
-    """What a table [free] says of a parameter otherwise than its rule does."""
+    """Where a table [free] differs from the declaration of a parameter."""
 
     low: float | None = key(None, "The fit goes no lower; in the parameter's unit.")
     high: float | None = key(None, "The fit goes no higher; in the parameter's unit.")
@@ -351,7 +351,7 @@ class Prior(eqx.Module):
         return np.where(np.asarray(self.uniform), special.expit(z), special.ndtr(z))
 
     def widened(self, factor: float) -> "Prior":
-        """The prior with all spreads multiplied; one that was uniform is so no more."""
+        """The prior with all spreads multiplied; a uniform one does not stay uniform."""
         return eqx.tree_at(lambda prior: prior.spread, self, factor * self.spread)
 
     def draw(self, random: np.random.Generator, count: int) -> Float[np.ndarray, "count free"]:
@@ -383,7 +383,7 @@ class Space(eqx.Module, Generic[System]):
     """The free parameters of a system as one unbounded vector `u`; `make_space` builds it."""
 
     system: System
-    """What is not free keeps the values it has here."""
+    """With the values of all that is not free."""
     prior: Prior
     """Of u."""
     start: Float[Array, " free"]
@@ -516,12 +516,12 @@ class Space(eqx.Module, Generic[System]):
             ValueError: for a centre outside the bounds of its parameter.
         """
         chosen = {name: priors.of(name) for name in self.names}
-        given = {name: p.centre for name, p in chosen.items() if p.centre is not None}
+        centres = {name: p.centre for name, p in chosen.items() if p.centre is not None}
         uniform = np.array([p.shape == "uniform" for p in chosen.values()])
         spread = [SPREAD if p.spread is None else p.spread for p in chosen.values()]
         dtype = self.start.dtype
         prior = Prior(
-            centre=jax.device_put(np.where(uniform, 0, self._centre(given))),
+            centre=jax.device_put(np.where(uniform, 0, self._centre(centres))),
             spread=jax.device_put(np.where(uniform, 1, np.asarray(spread)).astype(dtype)),
             uniform=jax.device_put(uniform),
         )
@@ -537,10 +537,10 @@ class Space(eqx.Module, Generic[System]):
         start = jax.device_put(self._inside("start", values))
         return eqx.tree_at(lambda space: space.start, self, start)
 
-    def _centre(self, given: Mapping[str, float]) -> Float[np.ndarray, " free"]:
+    def _centre(self, values: Mapping[str, float]) -> Float[np.ndarray, " free"]:
         """`u` of the centres of normal priors; the system's own are not too far out."""
-        centre, is_given = self._inside("centre", given), [name in given for name in self.names]
-        return np.where(is_given, centre, np.clip(centre, -OWN_CENTRE_LIMIT, OWN_CENTRE_LIMIT))
+        centre, is_set = self._inside("centre", values), [name in values for name in self.names]
+        return np.where(is_set, centre, np.clip(centre, -OWN_CENTRE_LIMIT, OWN_CENTRE_LIMIT))
 
     def _inside(self, what: str, values: Mapping[str, float]) -> Float[np.ndarray, " free"]:
         """`u` of values, the system's where left out, and not at a bound."""

@@ -82,12 +82,12 @@ def walk() -> tuple[jaxik.Rig, jaxik.Frame, jaxik.LegPose, Transform]:
         return clip.rig, frames_from_clip(clip), legs, joint
 
 
-def shown(walk: Any, **numbers: float) -> tuple[jaxik.LegPose, Transform]:
+def recorded(walk: Any, **numbers: float) -> tuple[jaxik.LegPose, Transform]:
     with jax.enable_x64(True):
         return compiled(dataclasses.replace(Capture(), **numbers), *walk)
 
 
-compiled = eqx.filter_jit(capture_system.shown)  # one program for all tests
+compiled = eqx.filter_jit(capture_system.recorded)  # one program for all tests
 
 
 def rotations(joint: Transform) -> Rotation:
@@ -96,7 +96,7 @@ def rotations(joint: Transform) -> Rotation:
 
 def test_a_capture_that_is_as_it_seems_shows_the_motion(walk):
     _, _, legs, pelvis = walk
-    same, same_pelvis = shown(walk)
+    same, same_pelvis = recorded(walk)
     for joint, other in ((same.ankle, legs.ankle), (same.knee, legs.knee), (same_pelvis, pelvis)):
         assert np.allclose(joint.pos, other.pos, atol=1e-12)
         assert np.allclose(joint.rot, other.rot, atol=1e-12)
@@ -104,7 +104,7 @@ def test_a_capture_that_is_as_it_seems_shows_the_motion(walk):
 
 def test_offsets_are_along_the_axes_of_each_foot_and_outward_on_its_own_side(walk):
     rig, _, legs, _ = walk
-    captured = shown(walk, ankle_forward=0.01, ankle_up=0.02, ankle_outward=0.03)[0].ankle
+    captured = recorded(walk, ankle_forward=0.01, ankle_up=0.02, ankle_outward=0.03)[0].ankle
     feet = Rotation.from_quat(
         np.tile(np.array(rig.ankle_from_foot), (len(legs.ankle.pos), 1)), scalar_first=True
     )
@@ -117,7 +117,7 @@ def test_offsets_are_along_the_axes_of_each_foot_and_outward_on_its_own_side(wal
 
 def test_a_ball_that_seems_elsewhere_turns_the_foot_towards_it(walk):
     rig, _, legs, _ = walk
-    captured = shown(walk, ball_up=0.02, ball_outward=0.01)[0].ankle
+    captured = recorded(walk, ball_up=0.02, ball_outward=0.01)[0].ankle
     assert np.allclose(captured.pos, legs.ankle.pos, atol=1e-12)
     ankle_from_foot = Rotation.from_quat(np.array(rig.ankle_from_foot), scalar_first=True)
     drop = np.asarray(rig.ball_height - rig.ankle_height)
@@ -134,7 +134,7 @@ def test_a_ball_that_seems_elsewhere_turns_the_foot_towards_it(walk):
 
 def test_lengths_are_scaled_about_the_middle_of_the_clip_on_its_floor(walk):
     _, frames, legs, pelvis = walk
-    captured, captured_pelvis = shown(walk, scale=1.02)
+    captured, captured_pelvis = recorded(walk, scale=1.02)
     centre = np.asarray(frames.world_from_model.pos).mean(axis=0)
     for joint, other in ((captured.knee, legs.knee), (captured_pelvis, pelvis)):
         assert np.allclose(joint.pos, centre + 1.02 * (other.pos - centre), atol=1e-9)
