@@ -40,17 +40,13 @@ def _residuals_of_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> list[Array]:
         return [residuals_of_scene(ik, scenes[0])]
     row = scene_in_a_row(scenes)
     errors = errors_by_kind(row, run_row(ik, scenes))
-    by_kind = residuals_by_kind(row, errors, _begins(scenes))
+    begins = np.concatenate([np.arange(len(scene.frames.dt)) == 0 for scene in scenes])
+    by_kind = residuals_by_kind(row, errors, begins)
     by_clip = {kind: split(r, scenes, r.shape[0]) for kind, r in by_kind.items()}
     return [
         jnp.concatenate([parts[number].ravel() for parts in by_clip.values()])
         for number in range(len(scenes))
     ]
-
-
-def _begins(scenes: Sequence[Scene]) -> Bool[np.ndarray, " frames"]:
-    """Which frames of clips in a row are the first of a clip."""
-    return np.concatenate([np.arange(len(scene.frames.dt)) == 0 for scene in scenes])
 
 
 def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:

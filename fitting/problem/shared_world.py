@@ -14,7 +14,7 @@ thousand lengths need a few programs.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -31,7 +31,7 @@ from jaxik.world import grid, places
 from jaxik.world.surfaces import Mesh
 from jaxik.world.terrain import Terrain, merge
 
-from .scene import WHITENED, Place, Scene, Sigmas, own_system
+from .scene import WHITENED, Place, Scene, own_system
 
 Tree = TypeVar("Tree")
 
@@ -123,24 +123,19 @@ def run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> jaxik.Result:
 def scene_in_a_row(scenes: Sequence[Scene]) -> Scene:
     """The scenes one after another, each in its own world; body and sigmas are those of frames."""
     first, plain = scenes[0], {"restart": None, "stride_scale": None, "rig": None}
-    parts = [
-        (
+    parts = []
+    for scene in scenes:
+        each = jnp.broadcast_to(scene.sigmas.correlation, len(WHITENED))  # where all share one, too
+        part = (
             _bodies(scene, first.rig),
             dataclasses.replace(scene.frames, **plain),
             scene.pelvis,
             dataclasses.replace(scene.reference, label=first.reference.label),
-            _for_frames(_with_each(scene.sigmas), scene),
+            _for_frames(dataclasses.replace(scene.sigmas, correlation=each), scene),
         )
-        for scene in scenes
-    ]
+        parts.append(part)
     rig, frames, pelvis, reference, sigmas = in_a_row(parts)
     return Scene(rig, first.terrain, frames, pelvis, reference, sigmas)
-
-
-def _with_each(sigmas: Sigmas) -> Sigmas:
-    """The sigmas with a correlation for each kind, also where all share one."""
-    each = jnp.broadcast_to(sigmas.correlation, len(WHITENED))
-    return dataclasses.replace(sigmas, correlation=each)
 
 
 def _bodies(scene: Scene, rig: jaxik.Rig) -> jaxik.Rig:
@@ -234,10 +229,9 @@ def _tracks_in_a_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> dict[str, Arr
 
 def _track(ik: jaxik.FootIK, scene: Scene, name: str) -> Array:
     """The value of a parameter in each frame of a scene."""
+    if name in scene.tracks:
+        return scene.tracks[name]
     value = jnp.asarray(parameter_tree.get(ik, name))
-    track = scene.tracks.get(name)
-    if track is not None:
-        return track
     return jnp.broadcast_to(value, (len(scene.frames.dt), *value.shape))
 
 
@@ -414,7 +408,7 @@ def stack(scenes: Sequence[Scene], *, rounded: bool = True) -> list[Stack]:
 
 def _stacked(members: Sequence[tuple[int, Scene]]) -> Stack:
     numbers, scenes = zip(*members, strict=True)
-    shares_terrain = _have_equal_leaves(scene.terrain for scene in scenes)
+    shares_terrain = all(_are_equal(scenes[0].terrain, scene.terrain) for scene in scenes[1:])
     apart = [_with_terrain(scene, None) if shares_terrain else scene for scene in scenes]
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *apart)
     if shares_terrain:
@@ -442,12 +436,3 @@ def _shapes(scene: Scene) -> object:
     """Equal for clips that one program computes."""
     leaves, structure = jax.tree.flatten(scene)
     return structure, tuple((np.shape(leaf), np.asarray(leaf).dtype.str) for leaf in leaves)
-
-
-def _have_equal_leaves(trees: Iterable[PyTree]) -> bool:
-    """Whether arrays of trees with the same shapes are the same."""
-    first, *others = (jax.tree.leaves(tree) for tree in trees)
-    return all(
-        all(a is b or np.array_equal(a, b) for a, b in zip(first, other, strict=True))
-        for other in others
-    )

@@ -56,16 +56,14 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
 @in_float64
 def with_motion_of(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> Problem[jaxik.FootIK]:
     """The same problem with references that any system makes, without noise."""
-    scenes = tuple(_with_reference(scene, *_motion_of(ik, scene)) for scene in problem.data)
-    return eqx.tree_at(lambda problem: problem.data, problem, scenes)
-
-
-def _motion_of(ik: jaxik.FootIK, scene: Scene) -> Motion:
-    """By the program that also plays clips, which a fit by the same system needs anyway."""
-    own, terrain = own_system(ik, scene), ik.probe.prepare(scene.terrain)
-    tracks = scene.tracks or None
-    result = program_cache.run(own, scene.rig, terrain, scene.frames, tracks=tracks)
-    return _motion(scene, result)
+    scenes = []
+    for scene in problem.data:
+        own, terrain = own_system(ik, scene), ik.probe.prepare(scene.terrain)
+        tracks = scene.tracks or None
+        # The program that also plays clips, which a fit by the same system needs anyway.
+        result = program_cache.run(own, scene.rig, terrain, scene.frames, tracks=tracks)
+        scenes.append(_with_reference(scene, *_motion(scene, result)))
+    return eqx.tree_at(lambda problem: problem.data, problem, tuple(scenes))
 
 
 def _with_reference(
@@ -113,10 +111,7 @@ def _simulated(
 @cached
 def _motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Motion]:
     """The motion of a system on each clip, as a capture would record it."""
-    motions = []
-    for scene, result in zip(scenes, run_scenes(ik, scenes), strict=True):
-        motions.append(_motion(scene, result))
-    return motions
+    return [_motion(*pair) for pair in zip(scenes, run_scenes(ik, scenes), strict=True)]
 
 
 @cached

@@ -147,7 +147,7 @@ def test_a_late_capture_shows_what_was_before(walk, shift):
     time = np.arange(len(pos)) / fps
     slopes = np.gradient(pos, 1 / fps, axis=0)
     wanted = CubicHermiteSpline(time, pos, slopes)(time - shift)  # Catmull and Rom's, independently
-    got = np.asarray(shown(walk, time_shift=shift)[1].pos)
+    got = np.asarray(recorded(walk, time_shift=shift)[1].pos)
     assert np.allclose(got[4:-4], wanted[4:-4], atol=1e-9)
     weights = jnp.arange(len(pos), dtype=float)
     with jax.enable_x64(True):
@@ -236,12 +236,14 @@ def test_errors_are_those_from_what_the_capture_would_show(tmp_path):
         world = scene.frames.world_from_model
         legs = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
         pelvis = world @ scene.pelvis
-        shown_legs, shown_pelvis = compiled(moved.of_clip(0), scene.rig, scene.frames, legs, pelvis)
+        recorded_legs, recorded_pelvis = compiled(
+            moved.of_clip(0), scene.rig, scene.frames, legs, pelvis
+        )
         reference = dataclasses.replace(
             scene.reference,
-            ankle=shown_legs.ankle,
-            knee_ws=shown_legs.knee.pos,
-            pelvis=shown_pelvis,
+            ankle=recorded_legs.ankle,
+            knee_ws=recorded_legs.knee.pos,
+            pelvis=recorded_pelvis,
         )
         largest = {}
         for name, each in (("captured", captured), ("as it seems", scene)):
