@@ -1,4 +1,4 @@
-"""What the user asks for in files: experiments, systems with their parameters, ablations.
+"""The files of the user: experiments, systems with their parameters, ablations.
 
 Reading a file checks every key and value and says what is wrong, where, and what would be right;
 `problems` then loads the clips and builds the `Problem` that is minimised. Nothing is computed or

@@ -144,7 +144,7 @@ class Experiment(Shown):
     clips: tuple[ClipEntry, ...] = key(NEEDED, "The clips.", wanted="[[clips]], one for each clip")
     free: FreeTable = key(
         NEEDED,
-        "What is fitted, if anything; {} takes range, kind and scale from the rule's declaration.",
+        "What is fitted, if anything; {} leaves range, kind and scale to the rule's declaration.",
     )
     capture: FreeTable = key(
         {}, "What is not known of the captures and fitted beside the system, for each clip."
@@ -214,7 +214,7 @@ class Experiment(Shown):
         if self.noise.sigmas == "estimated" and self.loss not in ("squares", "student"):
             raise ValueError(
                 f"{self.path}: [noise] sigmas cannot be estimated under the loss {self.loss!r}, "
-                "which is not a distribution of noise; take squares, or student for outliers"
+                "which is not a distribution of noise; choose squares, or student for outliers"
             )
         if self.noise.correlation == "whitened" and self.independent_every:
             raise ValueError(
@@ -265,7 +265,7 @@ class Experiment(Shown):
         return None if leg_length is None else body.leg_length(rig) / leg_length
 
     def placed_clips(self) -> tuple[ClipEntry, ...]:
-        """The clips, with the root as animated where the system is told to place it itself."""
+        """The clips, with the root as animated where the system places it itself."""
         if not self.parameters.get(OWN_ROOT, False):
             return self.clips
         return tuple(
@@ -305,7 +305,7 @@ class Experiment(Shown):
         return len(self.free) + len(self._of_captures)
 
     def with_capture(self, ik: jaxik.FootIK) -> jaxik.FootIK:
-        """The system with what is not known of the captures, if something of it is fitted."""
+        """The system with the errors of the captures, if any are fitted."""
         return with_capture(ik, len(self.clips), list(self.capture)) if self.capture else ik
 
     def check_points(self, rig: jaxik.Rig | None) -> None:

@@ -116,9 +116,8 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
 
     Args:
         experiment: the experiment.
-        folder: in which the file is going to lie. Paths are relative to it, so that it may be moved
-            together with what they name; it is named itself, so that it may be moved alone. None
-            writes absolute paths.
+        folder: of the file. Paths are relative to it, so that it may be moved together with its
+            files; it is named itself, so that it may be moved alone. None writes absolute paths.
     """
     fit, sampler = experiment.fit, experiment.sample
     search = dataclasses.replace(fit.search, max_steps=SearchSettings().max_steps)
@@ -203,8 +202,8 @@ def _with_files(entry: ClipEntry, places: Places) -> ClipEntry:
             none of the files.
     """
     where = f"{places.file} [[clips]]"
-    found = {name: places.find(path, name) for name, path in entry.paths.items()}
-    entry = dataclasses.replace(entry, **found)
+    files = {name: places.find(path, name) for name, path in entry.paths.items()}
+    entry = dataclasses.replace(entry, **files)
     if entry.end is not None and entry.end <= entry.start:
         raise ValueError(
             f"{where}: end is {entry.end}; wanted more than start, which is {entry.start}"
@@ -213,6 +212,6 @@ def _with_files(entry: ClipEntry, places: Places) -> ClipEntry:
         read_joint_map(entry.joints)  # reports mistakes before any clip is read
     elif entry.joints is not None:
         check_joint_map(entry.joints, f"{where} joints")
-    files = [entry.reference] if entry.base is None else [entry.reference, entry.base]
-    entry.check_use(files, where)
+    clips = [entry.reference] if entry.base is None else [entry.reference, entry.base]
+    entry.check_use(clips, where)
     return entry

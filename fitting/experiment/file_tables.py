@@ -1,4 +1,4 @@
-"""What the tables of an experiment say that take its system or its clips to read."""
+"""The tables of an experiment that are read with its system or its clips."""
 
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -117,7 +117,7 @@ def known_names(capture: FreeTable, clips: int) -> list[str]:
 
 
 def entry_for(name: str, table: Mapping[str, Entry]) -> Entry | None:
-    """What a table has for a free parameter; that of a clip's capture may stand there for all."""
+    """The entry of a free parameter in a table; one of captures may stand there for all clips."""
     of_all = name.partition("[")[0] if is_of_capture(name) else name
     return table.get(name, table.get(of_all))
 
@@ -150,14 +150,13 @@ def prepare(scenes: Sequence[Scene], space: Space[jaxik.FootIK], where: str) -> 
         where: the table's place in its file, for error messages.
 
     Raises:
-        ValueError: the system sweeps shapes over ground that is to move, or nothing is left of a
-            clip.
+        ValueError: the system sweeps shapes over ground that moves, or nothing is left of a clip.
     """
     ground = [name for name in GROUND for p in space.parameters if p.leaf == f"{PREFIX}{name}"]
     if ground and isinstance(space.system.probe, SweepProbe):
         raise ValueError(
             f"{where}: {ground} cannot be fitted with the probe SweepProbe, whose shapes need the "
-            "ground as it is; leave them out, or take another probe in [rules]"
+            "ground as it is; leave them out, or choose another probe in [rules]"
         )
     prepared = list(scenes)
     for parameter in space.parameters:
@@ -168,7 +167,7 @@ def prepare(scenes: Sequence[Scene], space: Space[jaxik.FootIK], where: str) -> 
                 if not np.any(prepared[clip].reference.observed):
                     raise ValueError(
                         f"{where}: nothing is left of clip {clip + 1} without the {reach:g} s at "
-                        f"its ends that {SHIFT} may shift away; take a longer part of it, or a "
+                        f"its ends that {SHIFT} may shift away; use a longer part of it, or a "
                         "narrower range"
                     )
     return prepared
@@ -196,7 +195,7 @@ def refuse(capture: FreeTable, where: str, command: str) -> None:
     if capture:
         raise ValueError(
             f"{where} [capture]: {sorted(capture)} cannot be fitted by `jaxik {command}`, which "
-            "takes clips as they are; leave the table out, or see by `jaxik fit` what it finds"
+            "uses clips as they are; leave the table out, or see by `jaxik fit` what it finds"
         )
 
 
@@ -220,7 +219,7 @@ class Hierarchy:
         return (*self.per_subject, *self.per_clip)
 
     def level(self, name: str) -> str:
-        """What has its own value of a parameter: `clip` or `subject`; else it is `shared`."""
+        """Where a parameter varies: by `clip` or `subject`; else it is `shared`."""
         return (
             "clip" if name in self.per_clip else "subject" if name in self.per_subject else "shared"
         )
@@ -253,9 +252,9 @@ def check_hierarchy(
         where: the table's place in its file, for error messages.
 
     Raises:
-        ValueError: a name is not free or stands twice; a parameter is to vary between subjects, and
-            a clip does not say whom it shows, or all show the same; a parameter is to vary between
-            clips, and there is only one.
+        ValueError: a name is not free or stands twice; a parameter should vary between subjects,
+            and a clip does not name its subject, or all name the same; a parameter should vary
+            between clips, and there is only one.
     """
     for name in hierarchy.varying:
         if name not in free:
@@ -287,7 +286,7 @@ def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
         where: the table's place in its file, for error messages.
 
     Raises:
-        ValueError: a key is no key of the table and no free parameter, or a value is wrong.
+        ValueError: a key is neither of the table nor a free parameter, or a value is wrong.
     """
     entries = flatten(table, 2)
     check_keys(entries, [*DEFAULT_KEYS, *free], where)
@@ -295,11 +294,11 @@ def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
     default = check_table(default, DEFAULT_KEYS, where)
     named = {}
     for name, entry in entries.items():
-        given = check_table(entry, PRIOR_KEYS, f"{where} {name}")
-        normal = given.get("shape", default.get("shape")) != "uniform"
+        own = check_table(entry, PRIOR_KEYS, f"{where} {name}")
+        normal = own.get("shape", default.get("shape")) != "uniform"
         inherited: Content = default if normal else {"shape": "uniform"}
         with validation.error_context(f"{where} {name}"):
-            named[name] = ParameterPrior(**(inherited | given))
+            named[name] = ParameterPrior(**(inherited | own))
     with validation.error_context(where):
         return Priors(ParameterPrior(**default), named)
 
@@ -313,10 +312,10 @@ def priors_to_table(priors: Priors) -> Content:
 
 
 def read_start(table: Table, free: Collection[str], where: str) -> Mapping[str, float]:
-    """The values in a [start] table by dotted name; arguments as `read_priors`.
+    """The values in a [start] table by dotted name; arguments as for `read_priors`.
 
     Raises:
-        ValueError: a name is not free, or a value is no number.
+        ValueError: a name is not free, or a value is not a number.
     """
     values = flatten(table, 2)
     return check_table(values, dict.fromkeys(free, Key(NUMBER, "A value.")), where)

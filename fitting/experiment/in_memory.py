@@ -53,7 +53,7 @@ def with_files(experiment: Experiment, folder: Path | None) -> Experiment:
         folder: where the files are written; None writes none and leaves the experiment as it is.
 
     Raises:
-        ValueError: a terrain is no mesh, or a rule's name is not known; nothing is written then.
+        ValueError: a terrain is not a mesh, or a rule's name is not known; nothing is written then.
     """
     if folder is None:
         return experiment
@@ -177,7 +177,7 @@ def clip_entry(
 def make_experiment(
     *clips: ClipEntry, free: Free, system: jaxik.FootIK | str = DEFAULT_PRESET.name, **others: Any
 ) -> Experiment:
-    """An experiment, with no file on disk; `fitting.fit` and the other jobs take it as any other.
+    """An experiment, with no file on disk, for `fitting.fit` and the other jobs.
 
     Args:
         clips: made by `clip_entry`, or of files.
@@ -190,7 +190,7 @@ def make_experiment(
 
     Raises:
         ValueError: there is no clip, a preset or parameter does not exist, or a parameter cannot be
-            what it is to be.
+            free in this way.
     """
     if not clips:
         raise ValueError("no clip; wanted one at least, made by clip_entry")

@@ -109,7 +109,7 @@ def _is_on(ik: jaxik.FootIK, name: str) -> bool:
 
 
 def _off(ik: jaxik.FootIK) -> tuple[str, ...]:
-    """What belongs to something that is switched off, or that no original has."""
+    """Parameters of something that is switched off, or that no original has."""
     options = parameter_tree.options(ik)
     names = ("warp.",)  # of `Frame.stride_scale`
     names += () if options.get("probe.limited") else LIMITS
@@ -196,7 +196,7 @@ def original_of(name: str) -> Original:
 
 
 def to_settings(ik: jaxik.FootIK, name: str, *, drop: bool = False) -> dict[str, Value]:
-    """The settings of an original with which it does what a system does.
+    """The settings with which an original does the same as a system.
 
     Args:
         ik: the system.
@@ -205,7 +205,7 @@ def to_settings(ik: jaxik.FootIK, name: str, *, drop: bool = False) -> dict[str,
 
     Raises:
         ValueError: there is no such original; the system has other rules than it, or values that it
-            has no setting for, and they are not to be left out; two parameters that are one setting
+            has no setting for, unless they are dropped; two parameters that are one setting
             differ, or a parameter differs between legs where it may not.
     """
     original = original_of(name)
@@ -267,8 +267,8 @@ def _value(ik: jaxik.FootIK, setting: Setting, original: Original) -> Value:
     """The value of a setting, in its unit; one for all legs where they share it."""
     of_each = [np.asarray(parameter_tree.get(ik, leaf)) for leaf in setting.ours]
     if any(not np.allclose(value, of_each[0], rtol=RTOL, atol=ATOL) for value in of_each[1:]):
-        shown = ", ".join(f"{leaf} = {parameter_tree.shown(ik, leaf)}" for leaf in setting.ours)
-        raise ValueError(f"{setting.name} is one setting, but {shown}; make them equal")
+        values = ", ".join(f"{leaf} = {parameter_tree.shown(ik, leaf)}" for leaf in setting.ours)
+        raise ValueError(f"{setting.name} is one setting, but {values}; make them equal")
     value, single = of_each[0], _shape(ik, setting)
     if value.shape != single:
         if np.all(value == value[:1]):
@@ -338,8 +338,8 @@ def load_settings(path: Path) -> tuple[jaxik.FootIK, str]:
     """The system in a table of settings, and the name of its original.
 
     Raises:
-        ValueError: the file does not exist or is no such table; a setting is unknown, has another
-            unit than the original's, or a value that it cannot have.
+        ValueError: the file does not exist or is not such a table; a setting is unknown, has
+            another unit than the original's, or a value that it cannot have.
     """
     if reason := validation.why_unreadable(path):
         raise ValueError(f"{path}: {reason}, wanted a table of settings")
@@ -363,14 +363,14 @@ def _read(path: Path) -> Content:
     try:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
     except csv.Error as error:
-        raise ValueError(f"no table of settings: {error}") from None
+        raise ValueError(f"not a table of settings: {error}") from None
     if not rows or rows[0] != COLUMNS or any(len(row) != len(COLUMNS) for row in rows):
-        raise ValueError(f"no table of settings; wanted the columns {COLUMNS}")
+        raise ValueError(f"not a table of settings; wanted the columns {COLUMNS}")
     if len(systems := {row[0] for row in rows[1:]}) != 1:
         raise ValueError(f"settings of {sorted(systems)}; wanted those of one system")
     try:
         settings = {name: json.loads(value) for _, name, value, _ in rows[1:]}
     except RecursionError:
-        raise ValueError("no table of settings: a value is nested too deeply") from None
+        raise ValueError("not a table of settings: a value is nested too deeply") from None
     units = {name: unit for _, name, _, unit in rows[1:]}
     return {"system": systems.pop(), "settings": settings, "units": units}

@@ -78,7 +78,7 @@ def _tables(ik: jaxik.FootIK, preset: Preset, leg_length: float | None) -> Conte
 
 
 def _with_null(value: Any) -> Any:
-    """The value with None for inf, which is no JSON."""
+    """The value with None for inf, which JSON does not have."""
     if isinstance(value, Mapping):
         return {key: _with_null(entry) for key, entry in value.items()}
     if isinstance(value, list):

@@ -47,7 +47,7 @@ SHORTEST_WITH_HOLDOUT = 3.0  # s: of a shorter clip, hardly a stride would be le
 
 
 class ClipData(NamedTuple):
-    """What an entry of an experiment loads, over the same frames."""
+    """The files of an entry of an experiment, over the same frames."""
 
     reference: Clip
     base: Clip
@@ -107,7 +107,7 @@ def load_clips(experiment: Experiment) -> tuple[ClipData, ...]:
 
 
 def remarks(clips: Iterable[ClipData]) -> Iterator[str]:
-    """Lines on each clip: where its root is, jumps, and what was guessed or is odd."""
+    """Lines on each clip: where its root is, jumps, guesses and oddities."""
     for clip in clips:
         yield f"root of {clip.base.source}: {clip.root.reason}"
         if in_the_air := flight.describe(clip.base):

@@ -1,4 +1,4 @@
-"""Files that hold the game's parameter record: binary, CSV, or parameters in TOML."""
+"""Files of the game's parameter record: binary, CSV, or parameters in TOML."""
 
 import csv
 import warnings
@@ -107,10 +107,10 @@ def describe(entry: record.Record, reading: record.Reading) -> str:
 
 @in_float64
 def restrict(experiment: Experiment) -> Experiment:
-    """The experiment with only such free parameters as the game's record has room for.
+    """The experiment with only those free parameters that the game's record has room for.
 
-    Whatever else the system has is fixed at what a reader of the record assumes. So its fit loses
-    nothing when it is written as a record. What the restriction was made of stays in `whole`.
+    All others are fixed at what a reader of the record assumes, so that a fit loses nothing when it
+    is written as a record. The unrestricted experiment stays in `whole`.
 
     Raises:
         ValueError: the experiment has another preset, other rules, or parameters that differ

@@ -37,7 +37,7 @@ LEG = r"(\[\d+\])?"  # after the name of a free parameter: of one leg
 VALUES: dict[str, Content] = {  # of one number, by the kind of its leaf
     "b": {"type": "boolean"},
     "u": {"type": "integer", "minimum": 0, "maximum": 2**LAYERS - 1},
-    "f": {"type": ["number", "null"]},  # inf, which is no JSON, may come as null
+    "f": {"type": ["number", "null"]},  # inf, which JSON does not have, may come as null
 }
 
 

@@ -30,7 +30,7 @@ STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules to choose from, 
     for stage in fields(jaxik.FootIK)
 }
 
-OWN_ROOT = "root.enabled"  # which an experiment sets only to overrule where clips put the root
+OWN_ROOT = "root.enabled"  # set by an experiment only to overrule where clips put the root
 
 Rule = TypeVar("Rule", bound=eqx.Module)
 
@@ -50,7 +50,7 @@ def register_rule(rule: type[Rule]) -> type[Rule]:
         if isinstance(stage.type, type) and issubclass(rule, stage.type):
             STAGES[stage.name][rule.__name__] = rule
             return rule
-    raise ValueError(f"{rule.__name__} is no rule of a stage; the stages are {list(STAGES)}")
+    raise ValueError(f"{rule.__name__} is not a rule of a stage; the stages are {list(STAGES)}")
 
 
 def _are_numbers(values: np.ndarray) -> bool:
@@ -110,7 +110,7 @@ def preset_system(
     Args:
         name: of a function of `jaxik.presets`.
         rig: whose body it is for; None is the adult.
-        faithful: whether it is to be the original where the preset differs from it.
+        faithful: whether it should be the original where the preset differs from it.
 
     Raises:
         ValueError: there is no such preset, or it has no other original.
@@ -253,7 +253,7 @@ def read_free_table(table: Table, where: str) -> FreeTable:
         if isinstance(entry, Mapping) and (old := [key for key in MOVED_KEYS if key in entry]):
             moved = ", ".join(f"{MOVED_KEYS[key]} = {entry[key]}" for key in old)
             raise ValueError(
-                f"{where} {name}: {old[0]} is no key of [free] any more; write it in the table"
+                f"{where} {name}: {old[0]} is not a key of [free] any more; write it in the table"
                 f" [prior] of the experiment, as {name} = {{ {moved} }}"
             )
         check_table(entry, FREE_KEYS, f"{where} {name}")

@@ -59,7 +59,7 @@ def load_tracks(path: Path) -> dict[str, Track]:
     """Reads a track file.
 
     Raises:
-        ValueError: no such file, no TOML, or a track whose times and values do not fit.
+        ValueError: no such file, not TOML, or a track whose times and values do not fit.
     """
     tables = read_toml(path, "a track")
     tracks: dict[str, Track] = {}

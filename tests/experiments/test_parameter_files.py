@@ -114,7 +114,7 @@ def test_a_rule_is_known_to_parameter_files_and_experiments_once_it_is_registere
     ik, _ = parameter_files.load_system(path)
     assert type(ik.lean) is FixedLean
     assert float(parameter_tree.get(ik, "lean.angle")) == pytest.approx(0.2)
-    with pytest.raises(ValueError, match="FootIK is no rule of a stage; the stages are"):
+    with pytest.raises(ValueError, match="FootIK is not a rule of a stage; the stages are"):
         fitting.register_rule(FootIK)
 
 
@@ -246,7 +246,7 @@ def test_a_wrong_table_of_settings_costs_one_sentence(tmp_path):
     path = path.with_suffix(".csv")
     for damaged in ("[" * 100_000, '"' + "x" * 200_000):
         path.write_text(f"system,setting,value,unit\nozz,foot_heigh_,{damaged},m\n")
-        with pytest.raises(ValueError, match="no table of settings"):
+        with pytest.raises(ValueError, match="not a table of settings"):
             originals.load_settings(path)
 
 
