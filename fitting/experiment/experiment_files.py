@@ -28,14 +28,6 @@ from .experiment import (
     Experiment,
     FitOptions,
 )
-from .file_tables import (
-    Hierarchy,
-    check_hierarchy,
-    priors_to_table,
-    read_ablations,
-    read_priors,
-    read_start,
-)
 from .record_files import restrict
 from .systems import DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
@@ -75,20 +67,21 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in SIGMAS):
         raise ValueError(f"{path} [sigmas]: all of {list(SIGMAS)} are inf; wanted one that is not")
     free = read_free_table(top["free"], f"{path} [free]")
-    without = read_ablations(top.get("without", ()), ik, f"{path} [[without]]")
+    without = file_tables.read_ablations(top.get("without", ()), ik, f"{path} [[without]]")
     places = Places(path, top.pop("written_in", None))  # another is named when it is written again
     clips = tuple(_with_files(entry, places) for entry in top["clips"])
     capture = file_tables.read_capture(top.get("capture", {}), len(clips), f"{path} [capture]")
     known = [*free, *(name for ablation in without for name in ablation.free)]
     known = list(dict.fromkeys([*known, *file_tables.known_names(capture, len(clips))]))
     subjects = [clip.subject for clip in clips]
-    check_hierarchy(top.get("hierarchy", Hierarchy()), free, subjects, f"{path} [hierarchy]")
+    hierarchy = top.get("hierarchy", file_tables.Hierarchy())
+    file_tables.check_hierarchy(hierarchy, free, subjects, f"{path} [hierarchy]")
     top |= {
         "clips": clips,
         "free": free,
         "capture": capture,
-        "prior": read_priors(top.get("prior", {}), known, f"{path} [prior]"),
-        "start": read_start(top.get("start", {}), known, f"{path} [start]"),
+        "prior": file_tables.read_priors(top.get("prior", {}), known, f"{path} [prior]"),
+        "start": file_tables.read_start(top.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(top.get("parameters", {}), 2),
         "sigmas": sigmas,
         "without": without,
@@ -128,7 +121,7 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
         "clips": [clip_to_table(entry) for entry in experiment.clips],
         "fit": fit_table,
         "sample": {name: getattr(sampler, name) for name in USUAL_SAMPLE_KEYS} | changed(sampler),
-        "prior": priors_to_table(experiment.prior),
+        "prior": file_tables.priors_to_table(experiment.prior),
         "hierarchy": changed(experiment.hierarchy),
         "noise": vars(experiment.noise),
         "without": [vars(ablation) for ablation in experiment.without],

@@ -19,20 +19,10 @@ from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
+from . import systems
 from .experiment import ClipEntry, Experiment, LoadedFiles
 from .record_files import restrict
-from .systems import (
-    DEFAULT_PRESET,
-    OWN_ROOT,
-    STAGES,
-    Preset,
-    all_presets,
-    changed_rules,
-    changed_values,
-    leaf_names,
-    own_root,
-    with_rules,
-)
+from .systems import DEFAULT_PRESET, OWN_ROOT, Preset
 
 Selector: TypeAlias = Callable[[Any], object]  # of a system; its rules have leaves of their own
 Choice: TypeAlias = str | Selector
@@ -93,16 +83,18 @@ def _saved(entry: ClipEntry, folder: Path, ending: str, mesh: Mesh) -> ClipEntry
 def _with_named_rules(experiment: Experiment) -> Experiment:
     """The experiment with preset, rules and parameters instead of a system."""
     ik, preset = experiment.starting_system(), Preset(experiment.preset, experiment.faithful)
-    rules = changed_rules(ik, preset.system())
+    rules = systems.changed_rules(ik, preset.system())
     for stage, rule in rules.items():
-        if STAGES[stage].get(rule) is not type(getattr(ik, stage)):
+        if systems.STAGES[stage].get(rule) is not type(getattr(ik, stage)):
             raise ValueError(
                 f"{stage}: {rule} is a rule of your own, which a file can name only after "
                 "fitting.register_rule"
             )
-    values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
-    usual = with_rules(preset.system(), rules, "rules")
-    if OWN_ROOT not in changed_values(ik, usual) and OWN_ROOT not in experiment.parameters:
+    names = systems.leaf_names(ik)
+    values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in names}
+    usual = systems.with_rules(preset.system(), rules, "rules")
+    changed = systems.changed_values(ik, usual)
+    if OWN_ROOT not in changed and OWN_ROOT not in experiment.parameters:
         values.pop(OWN_ROOT, None)
     parameters = values | parameter_tree.options(ik)
     return replace(experiment, system=None, rules=rules, parameters=parameters)
@@ -203,7 +195,7 @@ def make_experiment(
         ik = system
         nearest = _nearest_preset(ik)
         others |= {"system": ik, "preset": nearest.name, "faithful": nearest.faithful}
-        others["parameters"] = own_root(ik, nearest.system()) | others.get("parameters", {})
+        others["parameters"] = systems.own_root(ik, nearest.system()) | others.get("parameters", {})
     table = free_table(free, ik)
     others = {"path": PATH, "name": PATH.name} | others
     experiment = Experiment(clips=clips, free=table, **others)
@@ -213,4 +205,6 @@ def make_experiment(
 
 def _nearest_preset(ik: jaxik.FootIK) -> Preset:
     """The preset from which a system's rules differ least, which files name."""
-    return min(all_presets(), key=lambda preset: len(changed_rules(ik, preset.system())))
+    return min(
+        systems.all_presets(), key=lambda preset: len(systems.changed_rules(ik, preset.system()))
+    )

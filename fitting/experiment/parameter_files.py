@@ -11,32 +11,15 @@ import numpy as np
 import tomli_w
 
 import jaxik
+from fitting.runtime import validation
 from fitting.runtime.declarations import key, keys, read
-from fitting.runtime.validation import (
-    QUOTED,
-    Content,
-    check_keys,
-    error_context,
-    flatten,
-    in_one_line,
-    nest,
-    read_json,
-    read_toml,
-    why_unreadable,
-)
+from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 from jaxik.world import body
 from jaxik.world.similarity import similar
 
-from .systems import (
-    DEFAULT_PRESET,
-    Body,
-    Preset,
-    changed_rules,
-    leaf_names,
-    with_parameters,
-    with_rules,
-)
+from . import systems
+from .systems import DEFAULT_PRESET, Body, Preset
 
 
 @dataclass(frozen=True)
@@ -65,49 +48,44 @@ def system_to_json(
     ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET, leg_length: float | None = None
 ) -> str:
     """The same as JSON, in which null stands for inf; arguments as for `system_to_toml`."""
-    content = _with_null(_tables(ik, preset, leg_length))
+    content = _replaced(_tables(ik, preset, leg_length), math.inf, None)
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 def _tables(ik: jaxik.FootIK, preset: Preset, leg_length: float | None) -> Content:
-    values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
+    values = {
+        name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in systems.leaf_names(ik)
+    }
     values |= parameter_tree.options(ik)
-    rules = changed_rules(ik, preset.system())
+    rules = systems.changed_rules(ik, preset.system())
     keys = preset.keys() | ({} if leg_length is None else {"leg_length": leg_length})
-    return keys | ({"rules": rules} if rules else {}) | nest(values)
+    return keys | ({"rules": rules} if rules else {}) | validation.nest(values)
 
 
-def _with_null(value: Any) -> Any:
-    """The value with None for inf, which JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: _with_null(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_with_null(entry) for entry in value]
-    return None if value == math.inf else value
-
-
-def _with_inf(value: Any) -> Any:
-    """The value with inf for None: the reverse of `_with_null`."""
-    if isinstance(value, Mapping):
-        return {key: _with_inf(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_with_inf(entry) for entry in value]
-    return math.inf if value is None else value
+def _replaced(content: Any, old: float | None, new: float | None) -> Any:
+    """The content with one value in place of another: JSON has None where numbers are infinite."""
+    if isinstance(content, Mapping):
+        return {key: _replaced(entry, old, new) for key, entry in content.items()}
+    if isinstance(content, list):
+        return [_replaced(entry, old, new) for entry in content]
+    return new if content == old else content
 
 
 def _read(path: Path) -> Content:
     """The tables of a parameter file."""
     if path.suffix.lower() != ".json":
-        return read_toml(path, "a parameter")
-    if reason := why_unreadable(path):
+        return validation.read_toml(path, "a parameter")
+    if reason := validation.why_unreadable(path):
         raise ValueError(f"{path}: {reason}, wanted a parameter file")
     try:
-        content = read_json(path)
+        content = validation.read_json(path)
     except ValueError as error:
-        raise ValueError(f"{path}: not JSON: {in_one_line(error, QUOTED)}") from None
+        raise ValueError(
+            f"{path}: not JSON: {validation.in_one_line(error, validation.QUOTED)}"
+        ) from None
     if not isinstance(content, dict):
         raise ValueError(f"{path}: wanted an object with a preset, rules or parameters")
-    return _with_inf(content)
+    return _replaced(content, None, math.inf)
 
 
 def leg_length_of(path: Path) -> float | None:
@@ -138,11 +116,11 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
     own_keys = {name: content.pop(name) for name in keys(ParameterFile) if name in content}
     top = read(own_keys, ParameterFile, str(path))
     own = None if top.body == "adult" or top.leg_length is not None else rig
-    with error_context(path):
+    with validation.error_context(path):
         ik = preset.system(own)
-    ik = with_rules(ik, top.rules, f"{path} [rules]", own)
-    check_keys(content, list(vars(ik)), str(path))
-    ik = with_parameters(ik, flatten(content, 2), str(path))
+    ik = systems.with_rules(ik, top.rules, f"{path} [rules]", own)
+    validation.check_keys(content, list(vars(ik)), str(path))
+    ik = systems.with_parameters(ik, validation.flatten(content, 2), str(path))
     if top.leg_length is not None and rig is not None:
         ik = similar(ik, body.leg_length(rig) / top.leg_length)
     return ik, preset

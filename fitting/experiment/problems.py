@@ -20,13 +20,7 @@ from fitting.clips.clip_frames import frames_from_clip, raised
 from fitting.ground import coverage, meshes
 from fitting.ground.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.ground.meshes import TerrainOptions
-from fitting.motion.flat_animation import (
-    as_flat_animation,
-    flatten_clip,
-    load_flat_animation,
-    with_cut_off_swings,
-    with_remark_if_uneven,
-)
+from fitting.motion import flat_animation
 from fitting.problem.capture_system import alone
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
@@ -171,8 +165,8 @@ def _load_reference(entry: ClipEntry) -> Clip:
 def _load_base(base: Path, entry: ClipEntry) -> Clip:
     if entry.loaded is not None and entry.loaded.base is not None:
         with error_context(base):
-            return as_flat_animation(entry.loaded.base)
-    return load_flat_animation(base, options=entry.of_file(base))
+            return flat_animation.as_flat_animation(entry.loaded.base)
+    return flat_animation.load_flat_animation(base, options=entry.of_file(base))
 
 
 def load_clip_data(
@@ -213,7 +207,7 @@ def load_clip_data(
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         check_ground(reference)
-        base = flatten_clip(
+        base = flat_animation.flatten_clip(
             reference,
             meshes.height_function(terrain),
             normal_under=meshes.normal_function(terrain),
@@ -228,7 +222,7 @@ def load_clip_data(
         )
     check_ground(base)
     placed, root = place_root(base, terrain, entry.root)
-    base = with_remark_if_uneven(base) if placed is base else placed
+    base = flat_animation.with_remark_if_uneven(base) if placed is base else placed
     base, tracks = track_files.along(base, entry.tracks, entry.start)
     return ClipData(reference, base, terrain, root, tracks)
 
@@ -266,7 +260,9 @@ def make_scene(
         held_out: frames that are not fitted; None are.
     """
     reference, base, terrain, root, tracks = data
-    frames = with_cut_off_swings(frames_from_clip(base, rise=root.rise), base, terrain)
+    frames = flat_animation.with_cut_off_swings(
+        frames_from_clip(base, rise=root.rise), base, terrain
+    )
     placed = raised(base, root.rise)
     legs = reference.leg_pose_ws()
     stance = reference.stance

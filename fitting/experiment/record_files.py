@@ -16,7 +16,7 @@ from fitting.runtime.precision import in_float64
 from jaxik import record
 from jaxik.maths import parameter_tree
 
-from . import parameter_files, systems
+from . import parameter_files
 from .experiment import Experiment
 from .systems import Preset, changed_rules
 
@@ -68,7 +68,7 @@ def read(
 
 def from_system(
     ik: jaxik.FootIK,
-    preset: systems.Preset,
+    preset: Preset,
     path: Path,
     reading: record.Reading,
     base: record.Record | None = None,
@@ -76,10 +76,9 @@ def from_system(
     drop: bool,
 ) -> record.Record:
     """The record with the parameters of a system; arguments and errors are those of `read`."""
-    original = systems.Preset("record", faithful=True)
-    if preset.name != original.name:
+    if preset.name != ORIGINAL.name:
         raise ValueError(f"{path}: parameters of {preset.name!r}; only those of 'record' make one")
-    if rules := systems.changed_rules(ik, original.system()):
+    if rules := changed_rules(ik, ORIGINAL.system()):
         raise ValueError(
             f"{path}: rules {rules}; only those of 'record' with faithful = true make one; "
             "`jaxik init --record-only` writes an experiment whose fit has them"
@@ -126,15 +125,15 @@ def restrict(experiment: Experiment) -> Experiment:
     }
     hierarchy = replace(
         experiment.hierarchy,
-        per_clip=_within(experiment.hierarchy.per_clip),
-        per_subject=_within(experiment.hierarchy.per_subject),
+        per_clip=_names_within(experiment.hierarchy.per_clip),
+        per_subject=_names_within(experiment.hierarchy.per_subject),
     )
     return replace(
         experiment,
-        free=_kept(experiment.free),
+        free=_entries_within(experiment.free),
         parameters={**experiment.parameters, **fixed},
-        prior=replace(experiment.prior, named=_kept(experiment.prior.named)),
-        start=_kept(experiment.start),
+        prior=replace(experiment.prior, named=_entries_within(experiment.prior.named)),
+        start=_entries_within(experiment.start),
         hierarchy=hierarchy,
         record_only=True,
         whole=replace(experiment, record_only=False),
@@ -154,12 +153,12 @@ def set_aside(experiment: Experiment) -> dict[str, tuple[str, str]]:
     return {name: values for name, values in lost.items() if name in whole.parameters}
 
 
-def _kept(table: Mapping[str, Entry]) -> dict[str, Entry]:
+def _entries_within(table: Mapping[str, Entry]) -> dict[str, Entry]:
     """The entries of parameters that the record has room for, and of captures."""
     return {name: entry for name, entry in table.items() if name in PLACES or is_of_capture(name)}
 
 
-def _within(names: tuple[str, ...]) -> tuple[str, ...]:
+def _names_within(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in names if name in PLACES)
 
 

@@ -1,13 +1,11 @@
 """The experiment file as JSON Schema (draft 2020-12), with which editors complete and check it.
 
-Keys, meanings, units, ranges and choices are those by which files are checked,
-defaults those of the classes that it makes, and parameters those that the rules declare. Checks
-across keys, and of other files, are left to the reader: what the schema allows may be refused.
+Keys, meanings, units, ranges and choices are those by which files are checked, defaults those of
+the classes, and parameters those that the rules declare. Checks across keys, and of other files,
+are left to the reader: what the schema allows may be refused.
 
-JSON Schema of what experiments say of a system: rules, parameters, and which are free.
-
-A table such as [parameters] may hold what any rule of a stage has. Which rule a file has follows
-from its preset and its [rules], so conditions then allow only the names of that rule.
+A table such as [parameters] may hold the parameters of any rule of a stage. Which rule a file has
+follows from its preset and its [rules], so conditions then allow only the names of that rule.
 """
 
 import functools
@@ -31,8 +29,6 @@ from .file_tables import DEFAULT_KEYS, PRIOR_KEYS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 TABLES = ("object", "array")
-
-
 LEG = r"(\[\d+\])?"  # after the name of a free parameter: of one leg
 VALUES: dict[str, Content] = {  # of one number, by the kind of its leaf
     "b": {"type": "boolean"},
@@ -51,7 +47,7 @@ def experiment_schema() -> Content:
     tables = of_system | {
         "capture": capture(),
         "prior": prior(),
-        "start": start(),
+        "start": _with_captures("start"),
         "sigmas": _sigmas(),
         "fit": _fit(),
     }
@@ -152,11 +148,6 @@ def capture(table: str = "free") -> Content:
     return closed({name: entry | {"description": d} for name, d in descriptions.items()}, clips)
 
 
-def start() -> Content:
-    """The schema of [start]: tables of parameters, and of captures."""
-    return _with_captures("start")
-
-
 def prior() -> Content:
     """The schema of [prior]: keys of its own, and tables of parameters, and of captures."""
     own = {name: declared.schema for name, declared in DEFAULT_KEYS.items()}
@@ -166,7 +157,7 @@ def prior() -> Content:
 
 
 def _with_captures(table: str) -> Content:
-    """The schema of free parameters in a table, those of captures too."""
+    """The schema of [start] or [prior]: tables of parameters, and of captures."""
     tables, entry = of_free_parameters(table), {"$ref": f"#/$defs/{table}"}
     names = "|".join(parameter_tree.declarations(Capture()))
     pattern = {rf"^capture\.({names}){LEG}$": entry}
