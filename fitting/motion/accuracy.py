@@ -1,12 +1,10 @@
-"""How far a solved motion is from the captured one.
+"""How far a solved motion is from the captured one, or from that of another system.
 
-The definitions are those of a benchmark's scoring script, against which the tests check them, so
-that figures compare. NumPy; world space, y up.
+The definitions of `Accuracy` are those of a benchmark's scoring script, against which the tests
+check them, so that figures compare. NumPy; world space, y up.
 
-How far a system's motion is from its reference, and how much of the reference it reproduces.
-
-The reference is what another system made of the same animation. What that system changed in the
-animation is its correction; what the fitted system does not reproduce of it remains.
+A `Difference` is between two systems on the same animation: the change that the reference system
+makes to the animation is its correction, and the part that the other does not reproduce remains.
 """
 
 from collections.abc import Mapping, Sequence
@@ -81,7 +79,7 @@ ACCURACY = Accuracy.measures()
 
 @dataclass(frozen=True)
 class Errors:
-    """Frame by frame what `Accuracy` summarises; `changes` run from one frame to the next."""
+    """The errors behind `Accuracy`, frame by frame; `changes` are between consecutive frames."""
 
     pelvis: Float[np.ndarray, " frames"]
     """m, height."""
@@ -145,7 +143,7 @@ def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
     """Differences between a solved clip and the captured one, over the same frames.
 
     Args:
-        solved: what foot IK made of the animation.
+        solved: the result of foot IK on the animation.
         captured: says when a foot stands, by its contact labels or else by its motion.
         animation: the flat animation, whose bones have the lengths of its rig.
     """
@@ -210,7 +208,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What remains of the correction of one quantity, m or rad."""
+    """The remainder of the correction of one quantity, m or rad."""
 
     correction: float
     """Rms."""
@@ -268,7 +266,7 @@ def _distances(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str
 
 
 def summarise_differences(clips: Sequence[Difference]) -> dict[str, dict[str, Remainder]]:
-    """What remains of each quantity, by phase: "all frames" of all clips.
+    """The remainder of each quantity, by phase: "all frames" of all clips.
 
     Where the character stands in some frames and moves in others, these are also the phases
     "standing" and "moving".
@@ -284,7 +282,7 @@ def summarise_differences(clips: Sequence[Difference]) -> dict[str, dict[str, Re
 def _remainders(
     clips: Sequence[Difference], chosen: Sequence[Bool[np.ndarray, " frames"]]
 ) -> dict[str, Remainder]:
-    """What remains of each quantity over the chosen frames of each clip."""
+    """The remainder of each quantity over the chosen frames of each clip."""
 
     def over_clips(series: Sequence[np.ndarray]) -> np.ndarray:
         pairs = zip(series, chosen, strict=True)

@@ -18,10 +18,10 @@ from fitting.runtime.precision import in_float64
 from .playback import Playback, play_all
 
 Side = Literal["below", "above"]
-SPAN = 1.0  # s, length of the part of a clip that tells most
+SPAN = 1.0  # s, length of the most informative part of a clip
 
-# What goes beyond a limit; in brackets by how much, where the clip shows to which value the limit
-# does not act yet. Angles of feet are against their shins, which lean as well as the ground.
+# Motion beyond a limit; in brackets by how much, where the clip shows up to which value the limit
+# has no effect. Angles of feet are against their shins, which lean like the ground.
 AT_LIMITS = {
     "foot.max_pitch": "a foot turned toes up[ beyond {}] against its shin, as on a slope up",
     "foot.min_pitch": "a foot turned toes down[ beyond {}] against its shin, as on a way down",
@@ -39,7 +39,7 @@ AT_LIMITS = {
     "probe.max_step_down": "steps down[ deeper than {}]",
     "probe.max_slope": "slopes[ steeper than {}]",
 }
-EVENTS = {  # what must happen at all
+EVENTS = {  # motion without which a parameter has no effect
     "pelvis.off_gain": "a run: moments without a foot on the ground",
     "lock.lock_half_life": "steps: feet that still move when they lock",
     "lock.unlock_half_life": "steps: locked feet that are released away from their animation",
@@ -75,7 +75,7 @@ class Evidence:
 def find_evidence(
     problem: Problem[jaxik.FootIK], solution: Sequence[Playback], profile: Profile
 ) -> tuple[Evidence, ...]:
-    """What keeps a parameter from going below and above its interval, where the data do.
+    """The frames that bound a parameter's interval below and above, where the data do.
 
     Args:
         problem: with its clips.
@@ -152,7 +152,7 @@ def _evidence(
 def describe_missing_motion(
     parameter: FreeParameter, unit: str, doc: str, profile: Profile, active: float | None
 ) -> str:
-    """What a clip would have to show, with the figure that must be exceeded where there is one.
+    """The motion that a clip lacks, with the figure to exceed where there is one.
 
     Args:
         parameter: one that is not determined.

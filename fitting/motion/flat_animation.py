@@ -1,15 +1,15 @@
 """Flat animations: what a game would play on flat ground, derived from a clip on uneven ground.
 
 Foot IK takes such an animation and the terrain, and should return the captured motion. To derive
-it, the terrain is taken out from under the feet: during a stance a foot is lowered by the height of
+it, the terrain is removed from under the feet: during a stance a foot is lowered by the height of
 the ground below it and turned about its ball by the ground's slope, which foot IK adds again;
 between two stances by a quintic smoothstep from one height to the next, and from one slope to a
 foot as captured in mid-swing. A foot whose foothold the start of a clip cuts off swings at the
 height of its next one: down stairs, through those that it comes from.
 
-The pelvis keeps its path in the ground plane at a constant height: what it does on uneven ground is
-for foot IK to find. Where the ground is flat, there is nothing to find, and the clip itself is such
-an animation. Knees follow from the law of cosines, in the plane in which the captured leg bends.
+The pelvis follows its path in the ground plane at a constant height: its motion on uneven ground is
+for foot IK to add. Where the ground is flat, there is nothing to add: the clip itself is such an
+animation. Knees follow from the law of cosines, in the plane in which the captured leg bends.
 """
 
 from collections.abc import Callable
@@ -61,9 +61,9 @@ def flatten_clip(
         clip: captured motion over terrain. Its contact labels decide when a foot stands; if it has
             none, they are detected from its motion.
         height_under: the height of the terrain.
-        normal_under: the normal of the terrain; None takes all of it for level.
-        pelvis_height: m; None keeps the captured heights on flat ground, and their mean above the
-            ground under the standing feet on any other.
+        normal_under: the normal of the terrain; None means level everywhere.
+        pelvis_height: m; None leaves the captured heights on flat ground; on any other it is their
+            mean above the ground under the standing feet.
 
     Raises:
         ValueError: a foot never stands, or the ground height under a stance is not finite.
@@ -110,7 +110,7 @@ def with_rigid_legs(clip: Clip) -> Clip:
 def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = AS_FOUND) -> Clip:
     """The animation in a file, ready for foot IK, with rigid legs.
 
-    Of a file that holds a captured clip and the flat animation below it, the latter.
+    If the file holds a captured clip and its flat animation, it is the latter.
 
     Args:
         path: the file.
@@ -141,7 +141,7 @@ def with_remark_if_uneven(clip: Clip) -> Clip:
     remark = (
         f"its feet stand at heights {100 * difference:.0f} cm apart, as if captured on uneven "
         "ground, and not animated on a flat floor: foot IK would add the terrain a second time. "
-        "Take the terrain of its capture with the root `auto` (`jaxik terrain` reconstructs it), "
+        "Use the terrain of its capture with the root `auto` (`jaxik terrain` reconstructs it), "
         "or make the clip the reference of an experiment without a base"
     )
     return replace(clip, remarks=(*clip.remarks, remark))
@@ -169,7 +169,7 @@ def stance_difference(clip: Clip) -> float:
 def ground_heights(
     clip: Clip, stance: np.ndarray, height_under: HeightFunction
 ) -> Float64[np.ndarray, "frames legs"]:
-    """Height of the ground to take out from under each foot, m.
+    """Height of the ground to remove from under each foot, m.
 
     During a stance it is the height below the median position of the ball, and between stances it
     changes smoothly. Before the first stance and after the last it is theirs.

@@ -44,7 +44,7 @@ INSIGNIFICANT = 2.0  # standard errors, below which an autocorrelation ends the 
 MIN_SPACING = 1e-3  # frames; the sum over lags may come out below zero
 MEDIAN = float(special.ndtri(0.75))  # median size of a standard normal
 MEDIAN_EFFICIENCY = 0.3675  # of the median of sizes as an estimate of scale (Huber 1981, 5.1)
-LARGEST = 3.0  # sigmas; beyond it a residual is taken as this large where outliers are expected
+LARGEST = 3.0  # sigmas, to which residuals are clipped where outliers are expected
 
 NEAR, FAR = 3.0, 5.0  # sigmas beyond which residuals are counted
 MANY_OUTLIERS = 0.005  # fraction beyond FAR; a normal has 6e-7, noise of Student's t with 4.4 this
@@ -52,11 +52,11 @@ LONGEST_OUTLIER = 3  # frames; what is far off for longer is a misfit
 MIN_SEEN = 0.5  # fraction of a stretch that must have been observed
 
 SIGNIFICANT = 1e-3  # p-value, over all groups, above which nothing is a finding
-TOO_LARGE = 1.25  # noise over the sigma that was given; likewise its inverse
+TOO_LARGE = 1.25  # noise over the sigma that was given; its inverse is too small
 STRUCTURED = 0.2  # autocorrelation from which residuals larger than their sigma are a misfit
 LOCAL = 1.5  # size of the worst seconds over that of the clip, from which they are a misfit
 CROWDED = 1.75  # frames for each residual that counts as independent: 32 % too narrow
-SPARSE = 0.5  # likewise: 41 % too wide
+SPARSE = 0.5  # frames for each such residual: 41 % too wide
 ABOUT_RIGHT = 0.1  # by which intervals may be too narrow or too wide and still be about right
 SMALL = 1e-4  # a p-value below it is called so
 ALMOST_NONE = 1e-6  # noise over its sigma, below which it is none
@@ -106,7 +106,7 @@ class Distances:
 
     @property
     def far(self) -> list[tuple[Part, str, float]]:
-        """Where the fitted motion does not look like the captured one: part, kind and distance."""
+        """Where the fitted motion visibly differs from the captured: part, kind and distance."""
         return [
             (part, kind, distance)
             for part, motions in self.parts.items()
@@ -116,7 +116,7 @@ class Distances:
 
     @property
     def better(self) -> Motion:
-        """Whose parameters are worth keeping: the fitted ones, or those from before the fit."""
+        """Whose parameters are better: the fitted ones, or those from before the fit."""
         worse = any(setback.other == "before" for setback in self.setbacks)
         return "before" if worse and self._score("before") < self._score("fitted") else "fitted"
 
@@ -126,7 +126,7 @@ class Distances:
         return min(reversed(MOTIONS), key=self._score)
 
     def _score(self, motion: Motion) -> float:
-        """All distances as one number: squares, in units of what looks the same."""
+        """All distances as one number: the sum of their squares, in units of `CLOSE`."""
         return sum(
             (distance / CLOSE[kind]) ** 2
             for motions in self.parts.values()
@@ -224,14 +224,14 @@ def measure_noise(
     Args:
         residuals: in sigmas.
         active: which of them count.
-        median: takes the size from the median, which should be this large, and residuals beyond
-            `FAR` as that large in the autocorrelation, so that a few outliers do not matter.
+        median: expected median size in sigmas; the size then follows from the median, and the
+            autocorrelation from clipped residuals, so that a few outliers do not matter.
         used: fraction of the degrees of freedom that the fit has used up.
     """
     count = int(active.sum())
     if not count:
         return Noise(0, 0.0, 0.0, 0.0, 0.0, 0, 1.0)
-    r, pairs = autocorrelations(tamed(residuals, active) if median else residuals, active)
+    r, pairs = autocorrelations(clipped(residuals, active) if median else residuals, active)
     small = np.abs(r) < INSIGNIFICANT / np.sqrt(np.maximum(pairs, 1))
     end = int(np.argmax(small)) if small.any() else len(r)
     lags = min(LAGS, len(r))
@@ -313,10 +313,10 @@ def _median_size(
     return math.sqrt(np.average(np.square(medians), weights=active.sum(axis=0)))
 
 
-def tamed(
+def clipped(
     residuals: Float[np.ndarray, "frames columns"], active: Bool[np.ndarray, "frames columns"]
 ) -> Float[np.ndarray, "frames columns"]:
-    """Residuals with those that are far out drawn in to `FAR` times their median-based scale."""
+    """Residuals clipped to `LARGEST` times their median-based scale."""
     limit = LARGEST * scale_by_median(residuals, active)
     return np.clip(residuals, -limit, limit)
 
@@ -350,8 +350,8 @@ class Assumed:
     whitened: bool = False
     """Whether their correlation was estimated and taken out."""
     counted: bool = False
-    """Whether intervals follow from size and correlation of the residuals: then sigmas are no
-    more than what a difference weighs."""
+    """Whether intervals follow from size and correlation of the residuals: then sigmas are only
+    weights of differences."""
     parameters: float = 0.0
     """How many parameters the data determine: the degrees of freedom that the fit has used."""
 
@@ -390,10 +390,10 @@ class Group:
     plain: Noise
     """Of the errors over their sigma, outliers left aside."""
     left: Noise
-    """Of the residuals before the loss: what is left once the given correlation is taken out. Under
-    a robust loss its size comes from the median."""
+    """Of the residuals before the loss, whitened by the correlation that was given. Under a robust
+    loss its size comes from the median."""
     near: float
-    """Fraction of the residuals beyond 3 standard deviations, these taken from the median."""
+    """Fraction of the residuals beyond 3 standard deviations, which follow from the median."""
     far: float
     """Fraction beyond 5."""
     has_outliers: bool
@@ -474,7 +474,7 @@ def _measure_group(
     robust = robust or has_outliers
     size = measure_noise(plain, active, assumed.median if robust else None, used)
     if robust:
-        plain, residuals = tamed(plain, active), tamed(residuals, active)
+        plain, residuals = clipped(plain, active), clipped(residuals, active)
     swing_ratio, swing_p = _swing(playback, kind, residuals, active, left)
     measured = kind in MEASURED and bool(active.any())
     return Group(
@@ -495,7 +495,7 @@ def _measure_group(
 
 
 def _lasting(far: Bool[np.ndarray, "frames columns"], frames: int) -> np.ndarray:
-    """Where something is so for more than this many frames on end."""
+    """Where a column is true for more than this many consecutive frames."""
     length = frames + 1
     lasting = np.zeros_like(far)
     if len(far) >= length:
@@ -567,8 +567,8 @@ class Verdict:
 def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Verdict:
     """Whether a fit is close to the capture, and no further off than its sigmas allow.
 
-    Too small a sigma is told from a misfit by the autocorrelation: what a system cannot follow
-    lasts for many frames.
+    Autocorrelation distinguishes a misfit from too small a sigma: motion that a system cannot
+    follow lasts for many frames.
     """
     measured = [group for group in groups if group.is_measured and group.left.count]
     if not measured or not distances.parts:
@@ -577,8 +577,8 @@ def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Ve
         sentence = f"Worse: {describe_setback(setbacks[0])}"
         if len(setbacks) > 1:
             sentence += f", and in {len(setbacks) - 1} more of the distances below"
-        kept = "of the fit" if distances.better == "fitted" else "from before the fit"
-        sentence += f". The parameters {kept} are the better ones"
+        better = "of the fit" if distances.better == "fitted" else "from before the fit"
+        sentence += f". The parameters {better} are the better ones"
         if distances.best == "animation":
             sentence += ", but without foot IK the whole motion is nearer"
         return Verdict(False, f"{sentence}.")
@@ -668,7 +668,7 @@ def _describe_misfits(misfits: Sequence[Group], limit: str = "sigma") -> str:
 
 
 def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -> str:
-    """What is wrong with the assumed noise, and what that does to intervals; "" if nothing is."""
+    """Errors of the assumed noise, and their effect on intervals; "" if there are none."""
     left = pooled([group.left for group in measured])
     frames = left.spacing * assumed.weight
     significant = any(group.left.autocorrelation_p < level for group in measured)
@@ -682,20 +682,20 @@ def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -
         findings.append(off)
         remedies.append("set the sigmas below")
     if correlated:
-        given = measured[0].correlation
+        assumption = measured[0].correlation
         plain = pooled([group.plain for group in measured])
-        found = plain.autocorrelation
+        observation = plain.autocorrelation
         # Relative to the frames for each independent error at the correlation that was given.
         width = plain.mean_square * plain.spacing * assumed.weight
-        width *= (1 - given) / (1 + given)
-        than = f", not by {given:.2f}" if given else ""
-        size = f"{found:.2f} from one frame to the next{than}"
+        width *= (1 - assumption) / (1 + assumption)
+        than = f", not by {assumption:.2f}" if assumption else ""
+        size = f"{observation:.2f} from one frame to the next{than}"
         if assumed.whitened:
             findings.append("the residuals are correlated even where the estimate is taken out")
             remedies.append('set `correlation = "counted"` in [noise]')
         else:
             findings.append(f"the residuals are correlated ({size})")
-            remedies.append(f"set `correlation = {found:.2f}`")
+            remedies.append(f"set `correlation = {observation:.2f}`")
     text = ""
     if findings:
         text = f"{' and '.join(findings)}: the intervals are {_width(width**0.5)}; "

@@ -1,9 +1,9 @@
-"""What a viewer sees of a motion on its ground: each measure with its unit, definition and bound.
+"""Visible qualities of a motion on its ground: each measure with unit, definition and bound.
 
 NumPy; lengths in metres, y up. The sole of a foot is known at two points: below the ankle, which
 stands for the heel, and below the ball. Each is as far below its joint, along the foot's up axis,
-as the joint is above the floor while the animated foot stands flat. What is visible is as large as
-the body: lengths that count are for an adult.
+as the joint is above the floor while the animated foot stands flat. Thresholds are lengths for an
+adult and scale with the body.
 """
 
 import math
@@ -23,7 +23,7 @@ from jaxik.world import body
 from jaxik.world.frame import UP
 from jaxik.world.terrain import Terrain
 
-VISIBLE = 0.02  # m: what a viewer notices of a sole off its ground, of a slide and of a pop
+VISIBLE = 0.02  # m, from which a viewer notices a sole off its ground, a slide and a pop
 TICK = 1.0 / 60.0  # s, the time over which a pop is measured
 STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
 LEVEL = 1e-3  # m, between the heights of ground that counts as a level floor
@@ -39,7 +39,7 @@ CONSTANT = 0.25  # of the mean, deviation below which heights count as equal
 HELPED = 0.5  # of the gaps that a remedy leaves at most, on average
 
 SOLES = ("ankle_height", "ball_height", "ankle_from_foot")  # of a rig: where the soles are
-SHOWN_PER_UNIT = {"%": 100.0, "cm": 100.0, "mm": 1000.0, "°": math.degrees(1.0)}
+DISPLAY_FACTORS = {"%": 100.0, "cm": 100.0, "mm": 1000.0, "°": math.degrees(1.0)}
 _SEEN = f"{100 * VISIBLE:.0f} cm or more"
 
 
@@ -59,11 +59,11 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """A word for something that is measured of a motion."""
+    """The declaration of a measure of motions."""
 
     heading: str
     unit: str
-    """In which it is shown."""
+    """Of its displayed value."""
     digits: int
     """After the decimal point."""
     meaning: str
@@ -77,8 +77,8 @@ class Measure:
 
     @property
     def factor(self) -> float:
-        """Shown value / value in SI units, radians and fractions of 1."""
-        return SHOWN_PER_UNIT.get(self.unit.split()[0], 1.0)
+        """Displayed value / value in SI units, radians and fractions of 1."""
+        return DISPLAY_FACTORS.get(self.unit.split()[0], 1.0)
 
     @property
     def title(self) -> str:
@@ -94,7 +94,7 @@ class Measure:
         return f"{'≥' if self.is_least else '≤'} {self.format(bound)}"
 
     def excess(self, value: float, bound: float) -> float:
-        """How many times what is allowed the value is: above 1 it is beyond its bound."""
+        """The value as a multiple of the allowed one: above 1 it is beyond its bound."""
         return (1.0 - value) / (1.0 - bound) if self.is_least else value / bound
 
 
@@ -108,11 +108,11 @@ def declared(
 
 @dataclass(frozen=True)
 class Figures:
-    """What is measured of a motion: SI units, radians and fractions of 1; NaN where unknown."""
+    """Measures of a motion: SI units, radians and fractions of 1; NaN where unknown."""
 
     @classmethod
     def measures(cls) -> dict[str, Measure]:
-        """What is declared of each, by name."""
+        """The declarations, by name."""
         return {f.name: f.metadata["measure"] for f in fields(cls) if "measure" in f.metadata}
 
     def text(self, name: str) -> str:
@@ -134,7 +134,7 @@ def _without_nan(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Measures(Figures):
-    """What a viewer sees of one motion on its ground."""
+    """Visible qualities of one motion on its ground."""
 
     penetration: float = declared(
         "penetration", "% of frames", 1,
@@ -237,7 +237,7 @@ class Measures(Figures):
 
     @property
     def visible(self) -> float:
-        """What a viewer notices of a sole in the ground of this body or above it, m."""
+        """Distance of a sole of this body from the ground that a viewer notices, m."""
         return VISIBLE * self.size
 
     @property
@@ -250,7 +250,7 @@ class Measures(Figures):
         return " · ".join(filter(None, [super().text(name), str(self.worst.get(name, ""))]))
 
     def against(self, limits: Mapping[str, float]) -> "list[Bounded]":
-        """What is known of these measures beside their bounds, the worst first.
+        """The known measures beside their bounds, the worst first.
 
         Args:
             limits: by name, as `bounds` gives them.
@@ -273,7 +273,7 @@ class Bounded(NamedTuple):
 
     name: str
     excess: float
-    """How many times what is allowed it is: above 1 it is beyond its bound."""
+    """The value as a multiple of the allowed one: above 1 it is beyond its bound."""
     words: str
 
     @property
@@ -308,7 +308,7 @@ class Soles:
 
 @dataclass(frozen=True)
 class PlacedMotion:
-    """A motion on its ground, and what a viewer sees of it."""
+    """A motion on its ground, and its visible qualities."""
 
     clip: Clip
     soles: Soles
@@ -328,7 +328,7 @@ def place(
     floor: float = 0.0,
     reached: Float64[np.ndarray, "frames legs"] | None = None,
 ) -> PlacedMotion:
-    """A motion with its soles over the terrain, and what is measured of it.
+    """A motion with its soles over the terrain, and its measures.
 
     Args:
         solved: the motion.
@@ -346,7 +346,7 @@ def soles(solved: Clip, flat: Clip, terrain: Terrain, floor: float = 0.0) -> Sol
     """The soles of a motion over a terrain; see `place`.
 
     The ground is looked for from `step_height` above the sole or the ground of the path, whichever
-    is higher: a character inside a hill is found to be in it, and a roof is no ground.
+    is higher, so that a character inside a hill is in the ground, and a roof is not ground.
     """
     points = sole_points(solved)
     path = ground_path.path_heights(solved, terrain, floor)
@@ -376,14 +376,9 @@ def measure(
     flat: Clip,
     reached: Float64[np.ndarray, "frames legs"] | None = None,
 ) -> Measures:
-    """What is measured of a motion; see `place`.
+    """The measures of a motion whose soles are `feet`; other arguments as for `place`.
 
-    Args:
-        feet: of the motion.
-        solved: as `place` has it, like what follows.
-        animated: whose ankles' corrections are none.
-        flat: whose slides do not count.
-        reached: 1 or 0 for each target.
+    Corrections are relative to `animated`, slides to `flat`.
     """
     names, gap, stance = solved.rig.names, feet.gap, feet.stance
     size = body.ratio(solved.rig)
@@ -534,7 +529,7 @@ def _extreme(series: Float64[np.ndarray, "frames legs"], names: tuple[str, ...])
 
 
 def bounds(animated: Clip, feet: Soles) -> dict[str, float]:
-    """The bounds of what is made of an animation, by measure, in SI units and fractions of 1.
+    """The bounds of motions made from an animation, by measure, in SI units and fractions of 1.
 
     They depend on the animation and the ground alone, so that every system has the same.
 
@@ -614,7 +609,7 @@ def likely_cause(
         feet: the soles of the animation.
         animated: the animation, with its root where the motion has it.
         unit: of the terrain, as it was read, m.
-        trial: tries their remedies; None takes them to help.
+        trial: tries their remedies; None assumes that they help.
     """
     visible = VISIBLE * body.ratio(animated.rig)
     standing = feet.stance & ~np.isnan(feet.gap)
@@ -625,11 +620,11 @@ def likely_cause(
     def helps(cause: Cause) -> bool:
         if trial is None:
             return True
-        if (tried := trial(cause)) is None:
+        if (remedied := trial(cause)) is None:
             return False
-        left = np.abs(tried.gap[feet.stance & ~np.isnan(tried.gap)])
-        covered = len(left) >= ENOUGH * feet.stance.sum()
-        return covered and bool(left.mean() <= HELPED * np.abs(gap).mean())
+        gaps = np.abs(remedied.gap[feet.stance & ~np.isnan(remedied.gap)])
+        covered = len(gaps) >= ENOUGH * feet.stance.sum()
+        return covered and bool(gaps.mean() <= HELPED * np.abs(gap).mean())
 
     if np.std(gap) <= CONSTANT * abs(np.mean(gap)) and abs(np.mean(gap)) > visible:
         return Cause("offset", float(np.mean(gap)))
@@ -652,7 +647,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def with_soles_of(captured: Clip, flat: Clip) -> Clip:
     """The captured clip with the soles of its flat animation.
 
-    Its own are measured as if it stood on a floor; on uneven ground they are not where they seem.
+    Its own are measured as if it stood on a floor, which is wrong on uneven ground.
     """
     rig, flat_rig = captured.measured_rig, flat.measured_rig
     if rig is None or flat_rig is None:

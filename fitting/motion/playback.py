@@ -1,4 +1,4 @@
-"""A clip before and after foot IK, and as captured: the numbers that reports and pictures show."""
+"""A clip before and after foot IK, and as captured: the numbers of reports and pictures."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ from jaxik.world.terrain import cast
 
 from .measures import knee_angle
 
-RAY_START = 1.0  # m above a joint, where the ray that looks for the ground under it starts
+RAY_START = 1.0  # m above a joint, where the ray to the ground under it starts
 RAY_LENGTH = 3.0  # m
 
 # In the order of a scene's residuals.
@@ -161,7 +161,7 @@ def _run_group(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> tuple[jaxik.Resul
 
 
 def stage_outputs(result: jaxik.Result) -> Trace:
-    """What each stage made, which the results of `jaxik.run` always hold."""
+    """The outputs of each stage, which results of `jaxik.run` always have."""
     if result.trace is None:
         raise ValueError("this result holds no trace; wanted one of jaxik.run")
     return result.trace
@@ -184,7 +184,7 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
     animated, solved = animated_legs_ws(scene), legs_ws(scene, result)
     animated_pelvis, solved_pelvis = world @ scene.pelvis, pelvis_ws(scene, result)
-    # The reference has no hips and toes: they keep their animated offsets from pelvis and ankles.
+    # The reference has no hips and toes: their offsets from pelvis and ankles are as animated.
     hip_offset = _per_leg(animated_pelvis).inverse().apply(animated.hip.pos)
     hips = _per_leg(reference.pelvis).apply(hip_offset)
     toes = reference.ankle.apply(animated.ankle.inverse().apply(animated.toe.pos))
@@ -231,7 +231,7 @@ def _positions(legs: jaxik.LegPose) -> tuple[Array, Array, Array, Array]:
 
 @dataclasses.dataclass(frozen=True)
 class ClipActivity:
-    """What one clip demands of a system; fractions are of the clip's frames."""
+    """The activity of a system on one clip; fractions are of the clip's frames."""
 
     legs: tuple[str, ...]
     frames: int
@@ -254,7 +254,7 @@ class ClipActivity:
 def measure(
     ik: jaxik.FootIK, scenes: Sequence[Scene], results: Sequence[jaxik.Result]
 ) -> list[ClipActivity]:
-    """What the clip of each scene demands of a system.
+    """The activity of a system on the clip of each scene.
 
     Args:
         ik: the system.
@@ -292,8 +292,8 @@ def active_limits(
 ) -> list[dict[str, float]]:
     """Fraction of each clip's frames that would differ with a limit at the end of its range.
 
-    Each frame is stepped from the state in which the system was before it, so that only what the
-    limit does in this frame counts. Limits are the smooth parameters named `limit`, `max_…` or
+    Each frame is stepped from the system's state before it, so that only the limit's effect in this
+    frame counts. Limits are the smooth parameters named `limit`, `max_…` or
     `min_…`.
     """
     pairs = zip(scenes, results, strict=True)
@@ -324,7 +324,7 @@ def _states_before(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> jaxi
 
 @dataclasses.dataclass(frozen=True)
 class Nudge:
-    """What changes when one threshold moves by a tenth of its range."""
+    """The changes when one threshold moves by a tenth of its range."""
 
     flipped: float
     """Fraction of the feet's decisions."""
@@ -335,7 +335,7 @@ class Nudge:
 def nudge_thresholds(
     problem: Problem, u: Float[np.ndarray, " free"]
 ) -> dict[str, tuple[Nudge, Nudge]]:
-    """What changes when a threshold moves down and up, by name.
+    """The changes when a threshold moves down and up, by name.
 
     Each threshold moves by a tenth of its range, but not beyond it, and the other parameters keep
     their values. The decisions are those of every foot in every frame: planted, lifted, locked, and

@@ -32,7 +32,7 @@ class SoleGap:
 
 @dataclass(frozen=True)
 class WorstWindow:
-    """The window with the largest residuals, and what they consist of."""
+    """The window with the largest residuals, and their composition."""
 
     start: int
     """Frame."""
