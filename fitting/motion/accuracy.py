@@ -18,13 +18,13 @@ import jaxik
 from fitting.clips.clip import Clip
 from fitting.clips.clip_frames import positions_by_role
 from fitting.problem.residuals import errors_by_kind, rotation_between
-from fitting.problem.scene import Scene, legs_ws, pelvis_ws
+from fitting.problem.scene import Scene, animated_legs_ws, legs_ws, pelvis_ws
 from fitting.problem.shared_world import run_scene
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.world.skeleton import Transform
 
-from .measures import MEASURES, Figures, declared, knee_angle, straight
+from .measures import MEASURES, Figures, declared, horizontal_steps, knee_angle, straight
 
 _IN_STANCE = "The same over the frames in which the foot stands."
 JOINTS = ("pelvis", "hip", "knee", "ankle")
@@ -118,10 +118,7 @@ def errors(
     ours, theirs = (
         {name: joints[name].astype(np.float64) for name in JOINTS} for joints in (solved, captured)
     )
-    our_steps, their_steps = (
-        np.linalg.norm(np.diff(joints["ankle"][..., [0, 2]], axis=0), axis=-1)
-        for joints in (ours, theirs)
-    )
+    our_steps, their_steps = (horizontal_steps(joints["ankle"]) for joints in (ours, theirs))
     thigh, shin = ours["knee"] - ours["hip"], ours["ankle"] - ours["knee"]
     our_angle, their_angle = (
         knee_angle(joints["hip"], joints["knee"], joints["ankle"]) for joints in (ours, theirs)
@@ -241,9 +238,8 @@ def measure(scene: Scene, result: jaxik.Result) -> Difference:
 
 def correction(scene: Scene) -> dict[str, Float[np.ndarray, "frames columns"]]:
     """How far the scene's reference is from its animation, by quantity, m or rad."""
-    world = scene.frames.world_from_model
-    legs = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
-    return _distances(scene, world @ scene.pelvis, legs)
+    pelvis = scene.frames.world_from_model @ scene.pelvis
+    return _distances(scene, pelvis, animated_legs_ws(scene))
 
 
 def _distances(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np.ndarray]:

@@ -101,21 +101,19 @@ def _frame_costs(
     problem: Problem[jaxik.FootIK], playbacks: Sequence[Playback]
 ) -> list[dict[str, np.ndarray]]:
     """The cost of every frame, (frames), by kind of residual, clip by clip."""
-    return [_frame_costs_of_clip(problem, playback) for playback in playbacks]
+    weight, tails = float(problem.weight), float(problem.tails)
 
-
-def _frame_costs_of_clip(
-    problem: Problem[jaxik.FootIK], playback: Playback
-) -> dict[str, np.ndarray]:
-    frames, costs = len(playback.dt), {}
-    fraction, tails = float(problem.weight), float(problem.tails)
-    for kind, residuals in playback.residuals.items():
+    def costs(frames: int, residuals: np.ndarray) -> np.ndarray:
         squares = np.asarray(residuals).reshape(len(residuals), -1) ** 2
         of_loss = rho(squares, problem.loss, tails, np)
         missing = frames - len(residuals)  # an acceleration has no first and no last frame
         sides = missing // 2, missing - missing // 2
-        costs[kind] = fraction * np.pad(0.5 * of_loss.sum(axis=1), sides)
-    return costs
+        return weight * np.pad(0.5 * of_loss.sum(axis=1), sides)
+
+    return [
+        {kind: costs(len(playback.dt), values) for kind, values in playback.residuals.items()}
+        for playback in playbacks
+    ]
 
 
 def _evidence(
