@@ -247,8 +247,7 @@ class Experiment(Shown):
     def leg_length(self, rig: jaxik.Rig) -> float | None:
         """Leg length, m, of the body that the numbers are for; None if they fit any body as is.
 
-        Args:
-            rig: of the first clip.
+        `rig` is that of the first clip.
         """
         if not self.hierarchy.scale_with_body:
             return None
@@ -257,9 +256,7 @@ class Experiment(Shown):
     def size(self, rig: jaxik.Rig, first: jaxik.Rig) -> float | None:
         """Leg length of a body over that of the body that the numbers are for; None as above.
 
-        Args:
-            rig: of the body.
-            first: of the first clip.
+        `first` is the rig of the first clip.
         """
         leg_length = self.leg_length(first)
         return None if leg_length is None else body.leg_length(rig) / leg_length
@@ -278,9 +275,7 @@ class Experiment(Shown):
     ) -> list[FreeParameter]:
         """The free parameters, as the rules declare them and the experiment overrides them.
 
-        Args:
-            ik: the experiment's system.
-            rig: whose body their ranges are for, unless the experiment is meant for the adult.
+        Their ranges are for the body of the rig, unless the experiment is meant for the adult.
 
         Raises:
             ValueError: a parameter is unknown, or cannot be what the experiment makes it.
@@ -311,9 +306,6 @@ class Experiment(Shown):
     def check_points(self, rig: jaxik.Rig | None) -> None:
         """Checks, before anything is compiled, that centres of priors and the start are in range.
 
-        Args:
-            rig: of the first clip.
-
         Raises:
             ValueError: one is not, or as `free_parameters`.
         """
@@ -332,11 +324,7 @@ class Experiment(Shown):
         return bool(self.start) or any(p.centre is not None for p in self.prior.named.values())
 
     def space(self, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Space[jaxik.FootIK]:
-        """The space of the free parameters, with their prior and the start.
-
-        Args:
-            ik: the experiment's system.
-            rig: as for `free_parameters`.
+        """The space of the free parameters of its system, with their prior and the start.
 
         Raises:
             ValueError: as `free_parameters`; the parameters leave each other no room; the centre of

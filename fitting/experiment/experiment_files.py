@@ -105,12 +105,10 @@ def _fit_options(value: object, where: str) -> FitOptions:
 
 
 def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> str:
-    """The experiment as TOML.
+    """The experiment as TOML for a file in a folder.
 
-    Args:
-        experiment: the experiment.
-        folder: of the file. Paths are relative to it, so that it may be moved together with its
-            files; it is named itself, so that it may be moved alone. None writes absolute paths.
+    Paths are relative to the folder, so that it may be moved together with its files; it is named
+    itself, so that it may be moved alone. Without a folder, paths are absolute.
     """
     fit, sampler = experiment.fit, experiment.sample
     search = dataclasses.replace(fit.search, max_steps=SearchSettings().max_steps)
@@ -167,12 +165,8 @@ class Places(NamedTuple):
     def find(self, path: Path, what: str) -> Path:
         """The file that a path names: from the experiment file, or else from where that was.
 
-        Args:
-            path: as the experiment file has it.
-            what: the key that has it, for the error message.
-
         Raises:
-            ValueError: there is no file to read at either place.
+            ValueError: there is no file to read at either place; the message names the key.
         """
         here = (self.file.parent / path).resolve()
         reason = validation.why_unreadable(here)

@@ -45,16 +45,11 @@ class Ablation:
 def read_ablations(
     tables: Sequence[Ablation], ik: jaxik.FootIK, where: str
 ) -> tuple[Ablation, ...]:
-    """Ablations by the dotted names of parameters.
-
-    Args:
-        tables: as a file has them.
-        ik: the system from which they differ.
-        where: the tables' place in their file, for error messages.
+    """Ablations of a system by the dotted names of parameters.
 
     Raises:
         ValueError: a stage, rule or parameter is unknown; a value is wrong; a name is empty or
-            taken; an ablation changes nothing.
+            taken; an ablation changes nothing. The message begins with `where`.
     """
     ablations: list[Ablation] = []
     for table in tables:
@@ -80,12 +75,7 @@ def _read(table: Ablation, ik: jaxik.FootIK, where: str) -> Ablation:
 
 
 def read_capture(table: Table, clips: int, where: str) -> FreeTable:
-    """The entries of a [capture] table by name.
-
-    Args:
-        table: as TOML reads it.
-        clips: how many the experiment has.
-        where: the table's place in its file, for error messages.
+    """The entries of a [capture] table by name, for so many clips.
 
     Raises:
         ValueError: a name or a clip is unknown, or a value is wrong.
@@ -123,12 +113,7 @@ def entry_for(name: str, table: Mapping[str, Entry]) -> Entry | None:
 
 
 def with_narrow_priors(priors: Priors, names: Iterable[str]) -> Priors:
-    """The priors with those of a capture, which are narrow where nothing else is said.
-
-    Args:
-        priors: as the experiment states them.
-        names: dotted, of the free parameters of captures.
-    """
+    """The priors with those of captures by name, which are narrow unless specified otherwise."""
     named = dict(priors.named)
     for name in names:
         prior = entry_for(name, priors.named) or ParameterPrior()
@@ -141,13 +126,8 @@ def with_narrow_priors(priors: Priors, names: Iterable[str]) -> Priors:
 def prepare(scenes: Sequence[Scene], space: Space[jaxik.FootIK], where: str) -> list[Scene]:
     """The scenes of clips whose captures are fitted.
 
-    Each keeps a ground of its own. Where the capture is shifted in time, frames at the ends of its
+    Each has a ground of its own. Where the capture is shifted in time, frames at the ends of its
     clip do not count, of which it may show nothing.
-
-    Args:
-        scenes: of all clips.
-        space: of the free parameters.
-        where: the table's place in its file, for error messages.
 
     Raises:
         ValueError: the system sweeps shapes over ground that moves, or nothing is left of a clip.
@@ -227,13 +207,7 @@ class Hierarchy:
     def grouping(
         self, names: Sequence[str], clips: Sequence[str], subjects: Sequence[str]
     ) -> Grouping:
-        """Which clips have the values of these parameters in common.
-
-        Args:
-            names: of the free parameters.
-            clips: a name for each clip, all different.
-            subjects: whom each clip shows.
-        """
+        """Which clips share the values of these parameters; all names of clips differ."""
         if not self.varying:
             return Grouping.pooled(len(clips), len(names))
         labels = {"clip": clips, "subject": subjects, "shared": None}
@@ -243,13 +217,7 @@ class Hierarchy:
 def check_hierarchy(
     hierarchy: Hierarchy, free: Collection[str], subjects: Sequence[str | None], where: str
 ) -> None:
-    """Checks the [hierarchy] of an experiment.
-
-    Args:
-        hierarchy: as the file has it.
-        free: names of the free parameters.
-        subjects: whom each clip shows; None where it does not say.
-        where: the table's place in its file, for error messages.
+    """Checks the [hierarchy] of an experiment; a clip without a subject has None.
 
     Raises:
         ValueError: a name is not free or stands twice; a parameter should vary between subjects,
@@ -276,14 +244,9 @@ def check_hierarchy(
 
 
 def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
-    """The priors in a [prior] table.
+    """The priors in a [prior] table of parameters with these names.
 
     A parameter without a shape or a spread of its own has the table's.
-
-    Args:
-        table: as TOML reads it.
-        free: names of all parameters that may have a prior.
-        where: the table's place in its file, for error messages.
 
     Raises:
         ValueError: a key is neither of the table nor a free parameter, or a value is wrong.

@@ -38,9 +38,7 @@ OF_FILES = {*keys(ClipOptions), *keys(TerrainOptions)}  # say how the files of a
 def with_files(experiment: Experiment, folder: Path | None) -> Experiment:
     """The experiment with nothing left in memory: with files in a folder, and rules by their names.
 
-    Args:
-        experiment: the experiment; as it is if it has nothing in memory.
-        folder: where the files are written; None writes none and leaves the experiment as it is.
+    Without a folder it stays as it is.
 
     Raises:
         ValueError: a terrain is not a mesh, or a rule's name is not known; nothing is written then.

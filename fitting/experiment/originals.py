@@ -306,13 +306,7 @@ def _shape(ik: jaxik.FootIK, setting: Setting) -> tuple[int, ...]:
 
 
 def settings_text(values: Mapping[str, Value], name: str, suffix: str) -> str:
-    """A table of settings.
-
-    Args:
-        values: as `to_settings` returns them.
-        name: of the original.
-        suffix: of the file, one of `SUFFIXES`.
-    """
+    """A table of settings of the original `name`, for a file with one of `SUFFIXES`."""
     units = {setting.name: setting.unit.name for setting in original_of(name).settings}
     if suffix == ".csv":
         out = io.StringIO()

@@ -36,10 +36,7 @@ def system_to_toml(
 ) -> str:
     """All rules, parameters, conventions, switches and options of a system, as TOML.
 
-    Args:
-        ik: the system.
-        preset: of which it differs.
-        leg_length: m, of the body that its numbers are for; None if they fit any body as they are.
+    `leg_length`, m, is that of the body that its numbers are for; None if they fit any as they are.
     """
     return tomli_w.dumps(_tables(ik, preset, leg_length))
 

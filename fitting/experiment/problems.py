@@ -251,13 +251,9 @@ def make_scene(
     label: str = "captured",
     held_out: Bool[np.ndarray, " frames"] | None = None,
 ) -> Scene:
-    """One clip as residuals need it.
+    """One clip as residuals need it, with sigmas that override the defaults.
 
-    Args:
-        data: the clip.
-        sigmas: override the defaults.
-        label: what plots call the reference.
-        held_out: frames that are not fitted; None are.
+    The label is that of the reference in plots; frames that are `held_out` are not fitted.
     """
     reference, base, terrain, root, tracks = data
     frames = flat_animation.with_cut_off_swings(

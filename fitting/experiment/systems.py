@@ -202,12 +202,7 @@ def changed_values(ik: jaxik.FootIK, other: jaxik.FootIK) -> dict[str, object]:
 
 
 def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK:
-    """The system with other values of parameters, conventions, switches and options.
-
-    Args:
-        ik: the system.
-        values: values by dotted name.
-        where: place of the values in their file, for the error message.
+    """The system with other values, by dotted name: parameters, conventions, switches, options.
 
     Raises:
         ValueError: a name is unknown, or a value has the wrong type or shape.

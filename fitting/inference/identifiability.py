@@ -63,16 +63,11 @@ def find_ridges(
     profiles: Mapping[str, Profile],
     undetermined: Sequence[str],
 ) -> tuple[Ridge, ...]:
-    """The ridges among undetermined parameters, of two or three.
+    """The ridges of two or three among the undetermined parameters.
 
     Along a ridge's profiles its parameters move together: the points that the data allow lie in a
     plane or on a line, in the parameters' fractions of their ranges. The direction across it is the
-    combination that the data determine.
-
-    Args:
-        parameters: all of them, in the order of the paths' columns.
-        profiles: by name.
-        undetermined: names among which ridges are sought.
+    combination that the data determine. The parameters are in the order of the paths' columns.
     """
     index = {parameter.name: i for i, parameter in enumerate(parameters)}
     ridges: list[Ridge] = []
@@ -197,10 +192,6 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
 
     The contraction of a parameter is `1 - (posterior width / prior width)²`, of 95 % intervals, on
     the scale on which its range is divided evenly.
-
-    Args:
-        problem: what was fitted.
-        solution: its best fit.
 
     Raises:
         ValueError: if the Jacobian at the solution is not finite.

@@ -76,9 +76,7 @@ class Likelihoods(NamedTuple):
 def expand(problems: Sequence[Problem], u: Float[np.ndarray, "clips free"]) -> Likelihoods:
     """The likelihoods of clips around a point each.
 
-    Args:
-        problems: of one clip each, with the same free parameters; their priors do not count.
-        u: the points.
+    The problems have one clip each and the same free parameters; their priors do not count.
     """
     each = [_expand(problem, row) for problem, row in zip(problems, u, strict=True)]
     return Likelihoods(u, *(np.stack(column) for column in zip(*each, strict=True)))
@@ -135,8 +133,7 @@ class Grouping:
     def of_labels(cls, labels: Sequence[Sequence[str] | None]) -> "Grouping":
         """The grouping in which clips with the same label share a value.
 
-        Args:
-            labels: for each parameter the labels of all clips, or None if they share it.
+        The labels are those of all clips for each parameter, or None if they share it.
 
         Raises:
             ValueError: all labels are None, so that the number of clips is not known.
@@ -468,11 +465,8 @@ class PopulationFit:
     def predict(self, grouping: Grouping, clip: int) -> Float[np.ndarray, " free"]:
         """The parameters that the fit, made without a clip, expects of it, in u.
 
-        Those of its own group where other clips belong to it, else the centre.
-
-        Args:
-            grouping: of all clips; the fit's is `grouping.without(clip)`.
-            clip: the one left out.
+        Those of its own group where other clips belong to it, else the centre. The grouping is of
+        all clips; the fit's is `grouping.without(clip)`.
         """
         others = np.delete(np.arange(len(grouping.group)), clip).tolist()
         predicted = self.centre.copy()
@@ -535,13 +529,9 @@ def model_around(
     grouping: Grouping,
     centre: Float[np.ndarray, " free"],
 ) -> MixedModel:
-    """The linear mixed model of the smooth parameters around these points.
+    """The linear mixed model of the smooth parameters around the points of these likelihoods.
 
-    Args:
-        likelihoods: of the clips.
-        space: of the free parameters, with their prior.
-        grouping: of the clips, for each free parameter.
-        centre: in u, where the prior is approximated.
+    The grouping is for each free parameter; the prior is approximated at the centre, in u.
     """
     smooth = np.flatnonzero(space.smooth)
     prior = approximate_prior(space.prior, centre)

@@ -121,13 +121,9 @@ class Estimate(NamedTuple):
 def likeliest(
     clips: Sequence[Errors], loss: Loss, tails: float, correlation: float | None
 ) -> Estimate:
-    """Sigma and correlation of the errors of one kind in all clips.
+    """Sigma and correlation of the errors of one kind in all clips, of which one counts at least.
 
-    Args:
-        clips: the errors; at least one of them counts.
-        loss: of the fit.
-        tails: degrees of freedom of Student's t.
-        correlation: if it is given; None to estimate it.
+    `correlation` is None to estimate it, too.
     """
 
     def at(rho: float) -> Estimate:
@@ -362,13 +358,7 @@ def measured(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]
 def counted(
     problem: Problem[jaxik.FootIK], u: Vector, errors: Sequence[Mapping[str, Any]] | None = None
 ) -> Problem[jaxik.FootIK]:
-    """The problem with the weight that its residuals at `u` say; see `likelihood_weight`.
-
-    Args:
-        problem: at its solution.
-        u: of the solution.
-        errors: of its motion, by kind, clip by clip, where they are known already.
-    """
+    """The problem at its solution with the weight of `likelihood_weight`."""
     weight = likelihood_weight(problem, u, errors)
     return with_noise(problem, dataclasses.replace(noise_of(problem), weight=weight))
 
@@ -382,7 +372,7 @@ def likelihood_weight(
     Of kinds of residuals, each a first-order autoregression, the variance of the score over the
     curvature, both summed (Pauli, Racugno and Ventura 2011): `(1 + rho) / (1 - rho)` frames are
     worth one, and residuals of twice their sigma a quarter. No residual counts as smaller than the
-    least sigma that a capture has.
+    least sigma that a capture has. The errors at `u`, by kind, clip by clip, may be known already.
     """
     noise = noise_of(problem)
     if errors is None:
@@ -512,13 +502,7 @@ def _sizes(legs: int) -> dict[str, int]:
 def draw_sigmas(
     problem: Problem[jaxik.FootIK], u: Float[np.ndarray, "steps walkers free"], seed: int
 ) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Draws of the sigmas that a problem leaves open, by kind, one for each of `thinned(u)`.
-
-    Args:
-        problem: with open sigmas.
-        u: samples of the posterior.
-        seed: of the draws.
-    """
+    """Draws of the open sigmas of a problem, by kind, one for each of the samples `thinned(u)`."""
     assert problem.unknown_sigmas is not None
     random = np.random.default_rng(seed)
     chosen = thinned(u)

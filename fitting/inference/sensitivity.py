@@ -49,9 +49,7 @@ AS_GOOD = 0.02  # of the possible gain in cost: among changes this similar, the 
 def all_parameters(ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> dict[str, dict[str, float]]:
     """Every declared parameter of a system as free, leg by leg where it has a value for each.
 
-    Args:
-        ik: the system.
-        rig: whose body the ranges are for; None is the adult.
+    Ranges are those for the body of the rig; None is the adult.
     """
     table: dict[str, dict[str, float]] = {}
     for name, declaration in scaled_declarations(ik, rig).items():
@@ -68,16 +66,9 @@ def measure_sensitivity(
 ) -> dict[str, float]:
     """How far each parameter can move these motions, in sigmas; without those that move none.
 
-    Ranges are those for the body of the first clip.
-
-    Each parameter in turn is swept over its range while the others stay where they are: at the
-    system's values, then at draws from a normal prior in the middle of the ranges.
-
-    Args:
-        ik: the system.
-        free: the parameters.
-        scenes: the clips; of these the sigmas count, the references do not.
-        seed: of the draws.
+    Each in turn is swept over its range, which is that for the body of the first clip, while the
+    others stay: at the system's values, then at draws from a normal prior in the middle of the
+    ranges. Of the scenes the sigmas count, the references do not.
     """
     rig = scenes[0].rig
     space = make_space(ik, [free_parameter(ik, name, rig, **given) for name, given in free.items()])
@@ -103,12 +94,9 @@ def sweep(
     scenes: tuple[Scene, ...],
     u: Float[np.ndarray, " free"],
 ) -> Iterator[tuple[Float[np.ndarray, " tried"], Float[np.ndarray, "tried residuals"]]]:
-    """For each parameter alone, its `u` over the range and how the residuals change from `u`.
+    """For each parameter alone, its `u` over the range and how the residuals change.
 
-    Args:
-        space: the parameters.
-        scenes: the clips.
-        u: where all the others stay.
+    The others stay at `u`, relative to which the residuals change.
     """
     present = np.asarray(space.values(u))
     log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
@@ -164,13 +152,10 @@ class Forecast:
 def choose_free(
     ik: jaxik.FootIK, candidates: FreeTable, scenes: tuple[Scene, ...]
 ) -> list[Forecast]:
-    """A forecast for each parameter, in the order of the table.
+    """A forecast for each candidate, in the order of the table.
 
-    Args:
-        ik: the system.
-        candidates: the parameters, with overrides of their declarations.
-        scenes: the clips; of these the sigmas count, the references do not. Ranges are those for
-            the body of the first one.
+    Ranges are those for the body of the first clip. Of the scenes the sigmas count, the references
+    do not.
     """
     rig, names = scenes[0].rig, list(candidates)
     parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
@@ -234,13 +219,9 @@ def leave_alone(
     scenes: tuple[Scene, ...],
     is_harmless: Callable[[jaxik.FootIK], bool],
 ) -> list[str]:
-    """Names of the parameters to change; no more than are needed.
+    """Names of the parameters to change so that the animations stay; no more than are needed.
 
-    Args:
-        ik: the system.
-        candidates: the parameters, with overrides of their declarations.
-        scenes: the clips, whose animations should stay as they are.
-        is_harmless: whether a system leaves them alone, which ends the search.
+    The search ends where `is_harmless` says that a system leaves the animations as they are.
     """
     rig = scenes[0].rig
     parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]

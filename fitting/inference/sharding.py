@@ -48,11 +48,7 @@ def over_devices(
 
     Its residuals come in another order, with zeros where clips were made longer or devices have
     less to do. With one device or one clip, a capture that is fitted, or residuals of another
-    kind, it stays as it is.
-
-    Args:
-        problem: of clips, as `problem_from_clips` makes it.
-        devices: those of JAX; None stands for all of this process.
+    kind, it stays as it is. By default the devices are all those of this process.
     """
     devices = jax.local_devices() if devices is None else list(devices)
     if (

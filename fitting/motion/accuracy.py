@@ -139,10 +139,8 @@ def errors(
 def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
     """Differences between a solved clip and the captured one, over the same frames.
 
-    Args:
-        solved: the result of foot IK on the animation.
-        captured: says when a foot stands, by its contact labels or else by its motion.
-        animation: the flat animation, whose bones have the lengths of its rig.
+    The captured clip says when a foot stands, by its contact labels or else by its motion. The flat
+    animation's bones have the lengths of its rig.
     """
     rig = animation.rig
     return errors(

@@ -77,10 +77,7 @@ def find_evidence(
 ) -> tuple[Evidence, ...]:
     """The frames that bound a parameter's interval below and above, where the data do.
 
-    Args:
-        problem: with its clips.
-        solution: the clips with the fitted system.
-        profile: of the parameter.
+    The solution is the clips with the fitted system.
     """
     names, evidence = problem.space.names, []
     before = _frame_costs(problem, solution)
@@ -152,12 +149,8 @@ def describe_missing_motion(
 ) -> str:
     """The motion that a clip lacks, with the figure to exceed where there is one.
 
-    Args:
-        parameter: one that is not determined.
-        unit: of it.
-        doc: its declared meaning.
-        profile: of it.
-        active: for a limit, the fraction of frames in which it changes the pose.
+    The parameter is not determined; `doc` is its declared meaning. For a limit, `active` is the
+    fraction of frames in which it changes the pose.
     """
     leaf = parameter.leaf
     low, high = profile.interval

@@ -309,11 +309,6 @@ def with_cut_off_swings(frames: jaxik.Frame, clip: Clip, terrain: Terrain) -> ja
     Each is as far behind the next one as the foot's first whole swing goes, on the line over the
     ball in the first frame, if the ground there is higher than at the next one. Lower ground does
     not count: where ground was made of a clip's footholds, it is not known there.
-
-    Args:
-        frames: of the clip.
-        clip: y up.
-        terrain: y up.
     """
     stance, balls_ws = clip.stance_labels(), clip.joints_ws(3)
     last_ws, fraction = np.array(frames.stride.last_ws), np.array(frames.stride.fraction)

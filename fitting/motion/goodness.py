@@ -137,9 +137,7 @@ class Distances:
 def measure_distances(before: Sequence[Playback], fitted: Sequence[Playback]) -> Distances:
     """The distances of three motions from the captured one, over all clips.
 
-    Args:
-        before: the clips with the system as it was before the fit.
-        fitted: the same clips with the fitted system.
+    The clips are those with the system as it was before the fit, and with the fitted one.
     """
     parts: dict[Part, dict[Motion, Kinds]] = {}
     frames: dict[Part, list] = {
@@ -420,10 +418,7 @@ def measure_groups(
 ) -> list[Group]:
     """All groups of a fit: of each clip, the kinds with a finite sigma.
 
-    Args:
-        playbacks: the clips with the fitted system.
-        correlations: that were given, of each clip, by kind; 0 for those left out.
-        assumed: by the fit.
+    The correlations are those of each clip that were given, by kind; 0 for those left out.
     """
     counts = [
         int(_active(playback, kind).sum())

@@ -250,11 +250,7 @@ class Measures(Figures):
         return " · ".join(filter(None, [super().text(name), str(self.worst.get(name, ""))]))
 
     def against(self, limits: Mapping[str, float]) -> "list[Bounded]":
-        """The known measures beside their bounds, the worst first.
-
-        Args:
-            limits: by name, as `bounds` gives them.
-        """
+        """The known measures beside their bounds, as `bounds` gives them; the worst first."""
         known = [self._bounded(name, limit) for name, limit in limits.items()]
         return sorted(
             (entry for entry in known if not math.isnan(entry.excess)), key=lambda e: -e.excess
@@ -531,11 +527,8 @@ def _extreme(series: Float64[np.ndarray, "frames legs"], names: tuple[str, ...])
 def bounds(animated: Clip, feet: Soles) -> dict[str, float]:
     """The bounds of motions made from an animation, by measure, in SI units and fractions of 1.
 
-    They depend on the animation and the ground alone, so that every system has the same.
-
-    Args:
-        animated: the animation, with its root where foot IK gets it.
-        feet: its soles.
+    They depend on the animation, with its root where foot IK gets it, and on the ground below its
+    feet alone, so that every system has the same.
     """
     size, ground = body.ratio(animated.rig), feet.ground[feet.stance]
     level = ground.size > 0 and float(np.ptp(ground)) < LEVEL  # false where some are NaN

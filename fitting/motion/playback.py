@@ -254,13 +254,7 @@ class ClipActivity:
 def measure(
     ik: jaxik.FootIK, scenes: Sequence[Scene], results: Sequence[jaxik.Result]
 ) -> list[ClipActivity]:
-    """The activity of a system on the clip of each scene.
-
-    Args:
-        ik: the system.
-        scenes: the clips with their terrains.
-        results: of this system on these scenes, such as `run_all` gives.
-    """
+    """The activity of a system on the clip of each scene, from its results on them."""
     limits = active_limits(ik, scenes, results)
     return [_measured(*clip) for clip in zip(scenes, results, limits, strict=True)]
 

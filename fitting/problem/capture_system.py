@@ -49,13 +49,7 @@ class CapturedSystem(jaxik.FootIK):
 
 
 def with_capture(ik: jaxik.FootIK, clips: int, names: Sequence[str]) -> CapturedSystem:
-    """A system with a capture without errors.
-
-    Args:
-        ik: the system.
-        clips: how many there are.
-        names: of the fields of `Capture` that are fitted.
-    """
+    """A system with a capture of so many clips without errors; the names are the fitted fields."""
     stages = {stage.name: getattr(ik, stage.name) for stage in dataclasses.fields(ik)}
     moves_ground = any(name in GROUND for name in names)
     return CapturedSystem(**stages, capture=Capture().for_clips(clips), moves_ground=moves_ground)
@@ -100,12 +94,7 @@ def system_and_scenes(
 
 
 def without_ends(scene: Scene, seconds: float) -> Scene:
-    """The scene without the frames at its ends for which nothing may be known after a shift.
-
-    Args:
-        scene: of one clip.
-        seconds: by how much the capture may be shifted at most.
-    """
+    """The scene without the frames at its ends that a shift of this size may leave unknown."""
     reference = scene.reference
     observed, held_out = np.array(reference.observed), np.array(reference.held_out)
     count = math.ceil(seconds / float(scene.frames.dt[-1])) + 1
@@ -123,12 +112,7 @@ def recorded(
 ) -> tuple[jaxik.LegPose, Transform]:
     """Legs, of which knee and ankle count, and pelvis as the capture of a clip would record them.
 
-    Args:
-        capture: of the clip.
-        rig: whose feet these are.
-        frames: of the clip.
-        legs: (frames legs), world space.
-        pelvis: (frames), world space.
+    Legs (frames legs) and pelvis (frames) are in world space.
     """
     centre_ws = centre_of(frames)
 

@@ -67,10 +67,7 @@ def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
 def errors_of_pose(scene: Scene, legs: jaxik.LegPose, pelvis: Transform) -> dict[str, Array]:
     """A motion minus the reference, by kind of residual that measures something, m and rad.
 
-    Args:
-        scene: of the reference.
-        legs: (frames legs), world space.
-        pelvis: (frames), world space.
+    Legs (frames legs) and pelvis (frames) are in world space.
     """
     reference, present = scene.reference, scene.rig.present[..., None]
     if scene.capture is not None:
@@ -89,10 +86,7 @@ def residuals_by_kind(
 ) -> dict[str, Array]:
     """Errors divided by their sigmas and whitened; 0 where the reference was not observed.
 
-    Args:
-        scene: of the errors.
-        errors: of `errors_by_kind`.
-        begins: which frames are the first of a clip, where several run in a row; None for one clip.
+    Where several clips run in a row, `begins` says which frames are the first of one.
     """
     observed, sigmas = scene.reference.observed, scene.sigmas
     follows = _follows(observed, begins)
@@ -141,13 +135,7 @@ def whitened(
 
     `(r_t - rho r_{t-1}) / sqrt(1 - rho²)` where both frames were observed, `r_t` where only this
     one was, 0 where it was not. They are independent if the errors are a first-order
-    autoregression.
-
-    Args:
-        residuals: in sigmas.
-        observed: which frames were.
-        correlation: from one frame to the next, in a shape that goes with the residuals.
-        begins: as for `residuals_by_kind`.
+    autoregression. `begins` is as for `residuals_by_kind`.
     """
     per_frame = (slice(None),) + (None,) * (residuals.ndim - 1)
     residuals = jnp.where(observed[per_frame], residuals, 0.0)

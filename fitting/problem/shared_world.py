@@ -161,10 +161,7 @@ def in_a_row(trees: Sequence[Tree]) -> Tree:
 def split(tree: Tree, scenes: Sequence[Scene], length: int | None = None) -> list[Tree]:
     """Arrays over the frames of these scenes in a row, scene by scene.
 
-    Args:
-        tree: of arrays along the frames.
-        scenes: in this order.
-        length: of these arrays, where frames at both ends of a clip have no value.
+    Their length is less than that of the scenes where frames at both ends of a clip have no value.
     """
     counts = [len(scene.frames.dt) for scene in scenes]
     ends = np.cumsum(counts)
@@ -392,10 +389,7 @@ def padded(scene: Scene, frames: int) -> Scene:
 def stack(scenes: Sequence[Scene], *, rounded: bool = True) -> list[Stack]:
     """Clips in as few stacks as their shapes allow, each with clips in their order.
 
-    Args:
-        scenes: of any length, body and ground.
-        rounded: whether lengths are rounded up to a few; else each stack is as long as its longest
-            clip, whatever that is.
+    Their lengths are rounded up to a few, or else to that of the longest clip.
     """
     longest = max(map(frame_count, scenes))
     groups: dict[object, list[tuple[int, Scene]]] = {}

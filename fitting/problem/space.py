@@ -145,12 +145,7 @@ def free_parameter(
 
 
 def check_inside(parameter: FreeParameter, what: str, value: float) -> None:
-    """Checks that a value is one that the parameter can take.
-
-    Args:
-        parameter: whose bounds count.
-        what: the value is, for the error message.
-        value: in the parameter's unit.
+    """Checks that a value is one that the parameter can have; `what` it is goes into the message.
 
     Raises:
         ValueError: it is outside the bounds.
@@ -434,13 +429,10 @@ class Space(eqx.Module, Generic[System]):
 
     @in_float64
     def pack(self, source: System | Mapping[str, ArrayLike]) -> Float[Array, "*rows free"]:
-        """`u` of a system, or of values by name; names left out keep this system's values.
+        """`u` of a system, or of values by name, one or as many as there are rows.
 
-        Values outside their bounds are clipped. Where the legs of a leaf differ but share one free
-        parameter, it takes their mean.
-
-        Args:
-            source: a system, or values; of each name one, or as many as there are rows.
+        Names left out have this system's values. Values outside their bounds are clipped. Where the
+        legs of a leaf differ but share one free parameter, it has their mean.
 
         Raises:
             ValueError: for a name that is not free.

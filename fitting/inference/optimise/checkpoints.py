@@ -154,10 +154,7 @@ class Checkpoints:
     ) -> Callable[[StoredProfiles], None]:
         """Calls `restore` with the profiles of a solution, where some of their stages are stored.
 
-        Args:
-            problem: what was fitted.
-            u: of the solution.
-            restore: takes the profiles over, or raises one of `DAMAGES`.
+        `restore` raises one of `DAMAGES` if they are not profiles of this problem.
 
         Returns:
             A function that stores the profiles, to call after every stage.

@@ -60,10 +60,7 @@ GOLDEN = (5**0.5 - 1) / 2
 def evolve(search: Search, state: SearchState, ends: list[Point]) -> SearchState:
     """The state at the best point that evolution reaches from the ends of several descents.
 
-    Args:
-        search: the problem and the settings.
-        state: at the best of the ends.
-        ends: points with costs and Jacobians; their values stay available to later generations.
+    The state is at the best of the ends, whose values stay available to later generations.
     """
     settings = search.settings
     donors = np.stack([end.u for end in ends])

@@ -115,15 +115,9 @@ def refine(
     u: Float[np.ndarray, " free"],
     settings: SearchSettings = DEFAULTS,
 ) -> Solution:
-    """A descent to the end from a point that is better than a solution, or for another noise.
+    """A descent to the end from `u`, better than the solution so far, or for another noise.
 
-    What the starts of the solution said of their agreement stays; effort and history add up.
-
-    Args:
-        problem: what to fit.
-        solution: the solution so far.
-        u: where the descent begins.
-        settings: how thoroughly to search.
+    The starts of the solution and their agreement stay; effort and history add up.
     """
     latest = SearchState.at(np.asarray(u))
     current = checkpoints.current()

@@ -149,12 +149,9 @@ class Conditional:
     def lowest(
         self, targets: Targets, starts: Sequence[Points], *, descending: bool = True
     ) -> Points:
-        """The lowest point found at each target; `starts` has some points to begin with for each.
+        """The lowest point found at each target, from some starts for each.
 
-        Args:
-            targets: the values.
-            starts: for each target.
-            descending: whether a descent may follow, far from the solution.
+        Where that is far from the solution, a descent may follow.
         """
         base, owner = join(starts), np.repeat(np.arange(len(starts)), [len(s.cost) for s in starts])
         gradient = np.zeros_like(base.u)  # near their own optimum, the targets apart

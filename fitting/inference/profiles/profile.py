@@ -88,7 +88,7 @@ def make_profile(
     costs: Float[np.ndarray, " points"],
     own_prior: Float[np.ndarray, " points"],
 ) -> Profile:
-    """The profile through some points, in any order.
+    """The profile of a parameter through some points, in any order.
 
     Args:
         parameter: whose profile it is.
@@ -121,12 +121,9 @@ def make_profile(
 def low_parts(
     places: Float[np.ndarray, " points"], rises: Float[np.ndarray, " points"], highest: float
 ) -> list[slice]:
-    """The minima of a curve, as runs of points that rise no higher than this in between.
+    """The minima of a curve, as runs of points that rise no higher than `highest` in between.
 
-    Args:
-        places: fractions of the range, rising.
-        rises: of the cost.
-        highest: rise up to which a point is low.
+    Places are fractions of the range, rising.
     """
     low = rises <= highest
     edges = np.flatnonzero(np.diff(np.concatenate([[False], low, [False]])))

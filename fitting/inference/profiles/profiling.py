@@ -91,14 +91,8 @@ def settle(
 
     One parameter moves at a time: a threshold by distances of all sizes, a smooth one by some
     standard deviations. That crosses cliffs, and follows ridges, along which thresholds must move
-    together.
-
-    Args:
-        conditional: the problem.
-        u: points at their targets.
-        targets: what stays.
-        spans: largest move of a threshold in each round, as fractions of the range; each round
-            moves on from the best so far.
+    together. Each round begins at the best point so far; its span is the largest move of a
+    threshold, as a fraction of the range.
     """
     space = conditional.problem.space
     for span in spans:

@@ -83,11 +83,7 @@ def summarise(
 ) -> list[ParameterSummary]:
     """One row per parameter: moments, central intervals, effective sample size, R-hat.
 
-    Args:
-        names: of the parameters.
-        values: without burn-in and isolated walkers, in the parameters' units.
-        times: autocorrelation times, in steps of `values`.
-        r_hat: of the same steps.
+    Values are without burn-in and isolated walkers, autocorrelation times in steps of these.
     """
     flat = values.reshape(-1, values.shape[-1])
     quantiles = np.quantile(flat, [0.025, 0.16, 0.5, 0.84, 0.975], axis=0)
@@ -170,15 +166,10 @@ def _mass(
 
 
 def check_lengths(stored: int, interval: int, limit: int) -> list[int]:
-    """Lengths at which to check a chain, beginning with the last two that are already behind.
+    """Lengths at which to check a chain, beginning with the last two before the `stored` steps.
 
     They depend on `stored` only in where they begin, so that a resumed run stops where the
-    uninterrupted one does. The last one is `limit`.
-
-    Args:
-        stored: steps that the chain has already.
-        interval: minimum steps between two checks.
-        limit: steps after which sampling ends.
+    uninterrupted one does. Two are at least `interval` steps apart, and the last one is `limit`.
     """
     lengths = []
     length = 0
@@ -193,14 +184,10 @@ def check_lengths(stored: int, interval: int, limit: int) -> list[int]:
 def verdict(
     before: Check | None, latest: Check, names: Sequence[str], thin_by: int, stop_at: float
 ) -> tuple[bool, str]:
-    """Whether the chain is long enough, and a sentence that says why.
+    """Whether the chain is long enough, by its last two checks, and a sentence that says why.
 
-    Args:
-        before: the check before the latest.
-        latest: the latest check.
-        names: of the parameters.
-        thin_by: steps of the sampler per step of the chain; the sentence counts the sampler's.
-        stop_at: required length in autocorrelation times of the slowest parameter.
+    Its autocorrelation times count steps of the sampler, of which `thin_by` are one of the chain.
+    `stop_at` is the required length in such times of the slowest parameter.
     """
     left_out = int(latest.isolated.sum())
     lengths = latest.length / latest.slowest

@@ -83,15 +83,11 @@ def _reweighted(
 
 
 def pareto_k(weights: Float[np.ndarray, " draws"], ess: float) -> float:
-    """Shape of the generalised Pareto distribution of the largest weights.
+    """Shape of the generalised Pareto distribution of the largest of these weights.
 
-    Of these there are as many as Vehtari et al. take: three times the root of the number of
-    independent draws, in units of draws, and at most a fifth of them. Minus infinity where all
-    weights are alike; infinite for too few draws.
-
-    Args:
-        weights: of the draws, up to a factor.
-        ess: effective number of draws.
+    As many are the largest as Vehtari et al. say: three times the root of the number of independent
+    draws, in units of draws, and at most a fifth of them. Minus infinity where all weights are
+    alike; infinite for too few draws.
     """
     from scipy import stats  # here, for it takes half a second to import
 
