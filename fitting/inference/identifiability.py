@@ -47,15 +47,24 @@ class Ridge:
 
     def describe(self, parameters: Mapping[str, FreeParameter]) -> str:
         """The combination in words: a sum, or a product where all scales are logarithmic."""
-        terms = list(zip(self.names, self.coefficients, strict=True))
-        if all(parameters[name].scale != "linear" for name in self.names):
-            powers = [(_factor(parameters[n]), _power(parameters[n], c)) for n, c in terms]
-            return _combined(powers, (" × ", " / "), "{name}^{size:.2g}")
-        summands = [
-            (_logarithm(parameters[n]), c if parameters[n].scale != "gain" else -c)
-            for n, c in terms
-        ]
-        return _combined(summands, (" + ", " - "), "{size:.2g} {name}")
+        is_product = all(parameters[name].scale != "linear" for name in self.names)
+        plus, minus = (" × ", " / ") if is_product else (" + ", " - ")
+        words, first = "", 1.0
+        for name, coefficient in zip(self.names, self.coefficients, strict=True):
+            scale = parameters[name].scale
+            term = f"half-life of `{name}`" if scale == "gain" else f"`{name}`"
+            if not is_product and scale != "linear":
+                term = f"ln({term})"
+            if scale == "gain":  # on whose scale a longer half-life is a smaller coordinate
+                coefficient = -coefficient
+            size = abs(coefficient)
+            if not np.isclose(size, 1, atol=0.05):
+                term = f"{term}^{size:.2g}" if is_product else f"{size:.2g} {term}"
+            if words:
+                words += (plus if coefficient * first > 0 else minus) + term
+            else:
+                words, first = term, coefficient
+        return words
 
 
 def find_ridges(
@@ -99,40 +108,6 @@ def _across(places: Float[np.ndarray, "points n"]) -> Float[np.ndarray, " n"] | 
     across = directions[-1]
     thin = spreads[-1] < THIN * spreads[-2]
     return across if thin and (np.abs(across) > SLIGHT * np.abs(across).max()).all() else None
-
-
-def _factor(parameter: FreeParameter) -> str:
-    return (
-        f"half-life of `{parameter.name}`" if parameter.scale == "gain" else f"`{parameter.name}`"
-    )
-
-
-def _power(parameter: FreeParameter, coefficient: float) -> float:
-    """On the scale of gains, a longer half-life is a smaller coordinate."""
-    return -coefficient if parameter.scale == "gain" else coefficient
-
-
-def _logarithm(parameter: FreeParameter) -> str:
-    factor = _factor(parameter)
-    return factor if parameter.scale == "linear" else f"ln({factor})"
-
-
-def _combined(terms: Sequence[tuple[str, float]], signs: tuple[str, str], term: str) -> str:
-    """Names with their coefficients in words, the first of them positive.
-
-    Args:
-        terms: names and coefficients.
-        signs: between terms, before a positive and before a negative coefficient.
-        term: how a `name` and the `size` of its coefficient are written, unless that is 1.
-    """
-    first = np.sign(terms[0][1])
-    words = ""
-    for name, coefficient in terms:
-        size = abs(coefficient)
-        sign = signs[0] if coefficient * first > 0 else signs[1]
-        words += sign if words else ""
-        words += name if np.isclose(size, 1, atol=0.05) else term.format(name=name, size=size)
-    return words
 
 
 @dataclasses.dataclass(frozen=True)

@@ -62,7 +62,7 @@ def all_parameters(ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> dict[str, 
 
 @in_float64
 def measure_sensitivity(
-    ik: jaxik.FootIK, free: FreeTable, scenes: tuple[Scene, ...], seed: int = 0
+    ik: jaxik.FootIK, free: FreeTable, scenes: tuple[Scene, ...]
 ) -> dict[str, float]:
     """How far each parameter can move these motions, in sigmas; without those that move none.
 
@@ -70,23 +70,22 @@ def measure_sensitivity(
     others stay: at the system's values, then at draws from a normal prior in the middle of the
     ranges. Of the scenes the sigmas count, the references do not.
     """
-    rig = scenes[0].rig
-    space = make_space(ik, [free_parameter(ik, name, rig, **given) for name, given in free.items()])
-    reach = np.max([_reach(space, scenes, u) for u in sweep_points(space, seed)], axis=0)
+    space = _space_of(ik, free, scenes)
+    swept = ([np.abs(c).max() for _, c in sweep(space, scenes, u)] for u in sweep_points(space))
+    reach = np.max(list(swept), axis=0)
     return {name: float(r) for name, r in zip(free, reach, strict=True) if r > NEGLIGIBLE}
 
 
-def sweep_points(space: Space, seed: int = 0) -> list[Float[np.ndarray, " free"]]:
+def _space_of(ik: jaxik.FootIK, free: FreeTable, scenes: tuple[Scene, ...]) -> Space:
+    """The space of parameters with ranges for the body of the first clip."""
+    rig = scenes[0].rig
+    return make_space(ik, [free_parameter(ik, name, rig, **own) for name, own in free.items()])
+
+
+def sweep_points(space: Space) -> list[Float[np.ndarray, " free"]]:
     """Where the other parameters stay during sweeps, u: as the system has them, and a few draws."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     return [np.asarray(space.pack({})), *(SPREAD * random.normal(size=(DRAWS, space.size)))]
-
-
-def _reach(
-    space: Space, scenes: tuple[Scene, ...], u: Float[np.ndarray, " free"]
-) -> Float[np.ndarray, " free"]:
-    """How far each parameter alone can move any residual from where it is at `u`, in sigmas."""
-    return np.array([np.abs(changes).max() for _, changes in sweep(space, scenes, u)])
 
 
 def sweep(
@@ -157,9 +156,7 @@ def choose_free(
     Ranges are those for the body of the first clip. Of the scenes the sigmas count, the references
     do not.
     """
-    rig, names = scenes[0].rig, list(candidates)
-    parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
-    space = make_space(ik, parameters)
+    space, names = _space_of(ik, candidates, scenes), list(candidates)
     seconds = float(np.mean([np.asarray(scene.frames.dt).mean() for scene in scenes]))
     information, reach = np.zeros((space.size, space.size)), np.zeros(space.size)
     points = sweep_points(space)
@@ -223,9 +220,7 @@ def leave_alone(
 
     The search ends where `is_harmless` says that a system leaves the animations as they are.
     """
-    rig = scenes[0].rig
-    parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
-    space = make_space(ik, parameters)
+    space = _space_of(ik, candidates, scenes)
     scenes = tuple(left_alone(scene) for scene in scenes)
     u, changed = np.asarray(space.pack({})), list[str]()
     while len(changed) < MOST and not is_harmless(space.unpack(u)):

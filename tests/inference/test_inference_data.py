@@ -14,7 +14,7 @@ from fitting.problem.space import ParameterPrior, Priors, Space
 from support import toy
 from support.problems import posterior_of, problem_of
 
-pytestmark = pytest.mark.skipif(not inference_data.is_available(), reason="needs ArviZ")
+pytestmark = pytest.mark.skipif(not blocks.is_available(), reason="needs ArviZ")
 NAMES = ("foot.share", "foot.limit[0]", "lock.height_on")
 
 
@@ -124,7 +124,7 @@ def test_a_file_without_log_likelihood_and_a_missing_package_are_said(
     for name in ("posterior.nc", "text.nc"):
         with pytest.raises(ValueError, match=f"{name}: no log-likelihood in it"):
             inference_data.read_blocks(tmp_path / name)
-    monkeypatch.setattr(inference_data, "PACKAGES", ("no_such_package",))
+    monkeypatch.setattr(blocks, "PACKAGES", ("no_such_package",))
     with pytest.raises(ImportError, match=r'pip install "jaxik\[posterior\]"'):
         posterior.to_inference_data(space)
 

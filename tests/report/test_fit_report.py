@@ -24,7 +24,7 @@ from fitting.experiment.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise import NoiseOptions
 from fitting.inference.optimise.solution import Progress, Solution
-from fitting.inference.sample import inference_data
+from fitting.inference.sample import blocks
 from fitting.inference.sample.modes import Mode
 from fitting.inference.sample.posterior import Posterior
 from fitting.motion import goodness, playback
@@ -389,7 +389,7 @@ def test_a_posterior_stands_beside_its_prior(fitted, tmp_path, undrawn):
     posterior = invented_posterior()
     text, numbers = write_posterior(tmp_path, replace(fitted, known_values=None), posterior)
     assert text.startswith("# hill\n\nThe posterior around a fit: **") and "true val" not in text
-    assert (tmp_path / run_folder.INFERENCE_DATA).exists() == inference_data.is_available()
+    assert (tmp_path / run_folder.INFERENCE_DATA).exists() == blocks.is_available()
     text, rows = text.split("### Prior and posterior")[1], numbers["parameters"]
     for row, summary in zip(rows, posterior.summary, strict=True):
         low, high = row["prior"]["interval"]

@@ -21,6 +21,7 @@ from fitting.runtime.declarations import Table, key
 # last beyond the next one. The same for every fit, so that fits can be compared.
 SECONDS = 1.0
 MIN_DRAWS = 100  # for the tail of the weights
+PACKAGES = ("arviz_base", "arviz_stats", "xarray", "h5netcdf")
 
 MAX_CHAIN = 2**33  # bytes of a chain, all of whose stored steps are held in memory
 
@@ -67,8 +68,8 @@ class LeaveOneOut:
 
 
 def is_available() -> bool:
-    """Whether the packages are installed that this needs."""
-    return all(importlib.util.find_spec(name) for name in ("arviz_base", "arviz_stats", "xarray"))
+    """Whether ArviZ and the packages with which it writes files are installed."""
+    return all(map(importlib.util.find_spec, PACKAGES))
 
 
 def to_tree(blocks: BlockLogLikelihood) -> Any:

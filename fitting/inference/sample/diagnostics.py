@@ -87,23 +87,17 @@ def summarise(
     """
     flat = values.reshape(-1, values.shape[-1])
     quantiles = np.quantile(flat, [0.025, 0.16, 0.5, 0.84, 0.975], axis=0)
-    mean, sd = flat.mean(axis=0), flat.std(axis=0, ddof=1)
-    low95, low68, median, high68, high95 = quantiles
-    return [
-        ParameterSummary(
-            name=name,
-            mean=float(mean[i]),
-            sd=float(sd[i]),
-            median=float(median[i]),
-            low68=float(low68[i]),
-            high68=float(high68[i]),
-            low95=float(low95[i]),
-            high95=float(high95[i]),
-            ess=float(flat.shape[0] / times[i]),
-            r_hat=float(r_hat[i]),
-        )
-        for i, name in enumerate(names)
-    ]
+    moments = flat.mean(axis=0), flat.std(axis=0, ddof=1)
+    table = np.stack([*moments, *quantiles, len(flat) / times, r_hat], axis=1)
+    summaries = []
+    for name, row in zip(names, table.tolist(), strict=True):
+        mean, sd, low95, low68, median, high68, high95, ess, r = row
+        summary = ParameterSummary(
+            name=name, mean=mean, sd=sd, median=median, low68=low68, high68=high68,
+            low95=low95, high95=high95, ess=ess, r_hat=r,
+        )  # fmt: skip
+        summaries.append(summary)
+    return summaries
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,6 @@
 ArviZ is optional; `pip install "jaxik[posterior]"` brings what is used here.
 """
 
-import importlib.util
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,20 +19,14 @@ from jaxik.maths import parameter_tree
 from . import blocks
 from .posterior import Posterior
 
-PACKAGES = ("arviz_base", "h5netcdf")
 PRIOR_DRAWS = 4000
 FORMAT = 1
 # What xarray and its engine raise for a damaged file.
 UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError)
 
 
-def is_available() -> bool:
-    """Whether the packages that this needs are installed."""
-    return all(importlib.util.find_spec(package) for package in PACKAGES)
-
-
 def _check_available() -> None:
-    if not is_available():
+    if not blocks.is_available():
         raise ImportError('this needs ArviZ: pip install "jaxik[posterior]"')
 
 

@@ -31,7 +31,7 @@ from fitting.experiment.experiment import Experiment
 from fitting.experiment.systems import Preset
 from fitting.inference.noise import NoiseModel, NoiseOptions
 from fitting.inference.optimise.solution import Solution
-from fitting.inference.sample import inference_data
+from fitting.inference.sample import blocks, inference_data
 from fitting.inference.sample.blocks import LeaveOneOut
 from fitting.problem.capture_system import alone, is_of_capture
 from fitting.problem.problem import Problem
@@ -270,7 +270,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
     if sampled.has_lower_point:
         begun_there = dataclasses.replace(sampled.experiment, start=posterior.best_values)
         _write_toml(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
-    if inference_data.is_available():
+    if blocks.is_available():
         inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)
 
 
