@@ -53,7 +53,7 @@ PLAY = (playback, "run")
 # What is announced, and the functions that take long while that is the innermost work going on.
 READ_AND_PREPARE = [
     ("Reading the clip and its ground", (problems, "load_clip_data")),
-    ("Preparing what is compared", (problems, "make_scene")),
+    ("Preparing the comparison", (problems, "make_scene")),
 ]
 FIT_WORK = [
     *READ_AND_PREPARE,

@@ -40,7 +40,7 @@ from .file_tables import Ablation, Hierarchy
 from .systems import DEFAULT_PRESET, OWN_ROOT, Body, Preset, with_parameters, with_rules
 
 DEVIATION = "Standard deviation of the residuals of"
-SIGMAS = {  # by kind: what a good fit of captured motion leaves, meaning and unit
+SIGMAS = {  # by kind: the error of a good fit of captured motion, meaning and unit
     "ankle": (0.02, f"{DEVIATION} ankle positions.", "m"),
     "knee": (0.03, f"{DEVIATION} knee positions.", "m"),
     "pelvis": (0.02, f"{DEVIATION} the pelvis's position.", "m"),
@@ -86,7 +86,7 @@ class ClipEntry(TerrainOptions, ClipOptions):
     end: float | None = key(None, "Where it ends; left out, with the clip.", "s", 0, 1e6)
     label: str = key("captured", "What plots call the reference.")
     mask_pops: bool = key(True, "Whether frames in which a captured marker jumps are left out.")
-    held_out: bool = key(False, "Whether the clip is not fitted, but shows what the fit is worth.")
+    held_out: bool = key(False, "Whether the clip is not fitted, but tests the fit.")
     root: Root = key(
         "auto",
         "Where the root is put: where the animation has it, on the ground below it, or on the"
@@ -95,7 +95,7 @@ class ClipEntry(TerrainOptions, ClipOptions):
     tracks: Path | None = key(None, "What changes along the clip: a track file.")
     subject: str | None = key(None, "Whom the clip shows, for [hierarchy].")
     loaded: LoadedFiles | None = field(default=None, repr=False, compare=False)
-    """What is in memory: then the paths of reference, terrain and base are names, and no files."""
+    """The clip in memory: then the paths of reference, terrain and base are names, not files."""
 
     @property
     def paths(self) -> dict[str, Path]:
@@ -133,7 +133,7 @@ FIT_KEYS = {
 
 @dataclass(frozen=True)
 class Experiment(Shown):
-    """What is fitted to what.
+    """Parameters of a system, and the clips to which they are fitted.
 
     Raises:
         ValueError: for noise that cannot be estimated in this way.
@@ -147,7 +147,7 @@ class Experiment(Shown):
         "What is fitted, if anything; {} leaves range, kind and scale to the rule's declaration.",
     )
     capture: FreeTable = key(
-        {}, "What is not known of the captures and fitted beside the system, for each clip."
+        {}, "Errors of the captures that are fitted beside the system, for each clip."
     )
     preset: str = key(DEFAULT_PRESET.name, "The system that is fitted.")
     faithful: bool = key(
@@ -164,8 +164,8 @@ class Experiment(Shown):
     )
     holdout: float = key(
         1 / 3,
-        "Fraction of each clip, its end, that is not fitted but shows what the fit is worth; clips"
-        " of less than 3 s are fitted whole.",
+        "Fraction of each clip, its end, that is not fitted but tests the fit; clips of less than"
+        " 3 s are fitted whole.",
         "",
         0.0,
         0.9,
@@ -181,13 +181,13 @@ class Experiment(Shown):
     seed: int = key(0, "Of all random numbers.", "", 0, 2**32 - 1)
     rules: Mapping[str, str] = key({}, "Rules that differ from the preset's, by stage.")
     parameters: Mapping[str, object] = key({}, "Fixed values that differ from the preset's.")
-    prior: Priors = key(Priors(), "What is known of free parameters before any clip.")
+    prior: Priors = key(Priors(), "The knowledge of free parameters before any clip.")
     start: Mapping[str, float] = key(
         {}, "Where the search begins; left out, at the system's values."
     )
     sigmas: Mapping[str, float] = key({}, "Standard deviation of each kind of residual.")
     noise: NoiseOptions = key(
-        NoiseOptions(), "Which properties of the noise are estimated, and what for."
+        NoiseOptions(), "Which properties of the noise are estimated, and for which purpose."
     )
     fit: FitOptions = key(FitOptions(), "How the best fit is searched for.")
     sample: SamplerSettings = key(SamplerSettings(), "How `jaxik sample` samples the posterior.")
@@ -195,18 +195,18 @@ class Experiment(Shown):
         (), "Variants that `jaxik ablate` fits.", wanted="[[without]], one for each variant"
     )
     hierarchy: Hierarchy = key(
-        Hierarchy(), "What several clips and subjects have in common; left out, everything."
+        Hierarchy(), "Which parameters several clips and subjects share; left out, all."
     )
     record_only: bool = key(
         False, "Whether free parameters that the game's record has no room for are left out."
     )
     written_in: str | None = key(
         None,
-        "Where the file was written: paths start there that lead nowhere from the file itself, as"
-        " after moving a run alone.",
+        "Where the file was written: there start paths that lead nowhere from the file itself, such"
+        " as after moving a run alone.",
     )
     whole: "Experiment | None" = None
-    """What an experiment of the record alone was made of."""
+    """The unrestricted experiment, of one with `record_only`."""
     system: jaxik.FootIK | None = field(default=None, repr=False, compare=False)
     """With any rules, instead of those of preset and `rules`; for any body as it is."""
 

@@ -34,7 +34,7 @@ DEFAULT_KEYS = {name: PRIOR_KEYS[name] for name in ("shape", "spread")}
 
 @dataclass(frozen=True)
 class Ablation:
-    """What differs from the experiment, under a name."""
+    """A named variant of the experiment."""
 
     name: str = key(NEEDED, "What is left out.")
     rules: Mapping[str, str] = key({}, "Other rules, by stage.")
@@ -181,7 +181,7 @@ def refuse(capture: FreeTable, where: str, command: str) -> None:
 
 @dataclass(frozen=True)
 class Hierarchy:
-    """What several clips and subjects have in common."""
+    """Which parameters several clips and subjects share."""
 
     per_subject: tuple[str, ...] = key(
         (), "Free parameters of which each subject has its own value.", wanted=NAMES

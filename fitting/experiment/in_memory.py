@@ -171,7 +171,7 @@ def make_experiment(
 
     Args:
         clips: made by `clip_entry`, or of files.
-        free: what is fitted: dotted names, or functions that pick leaves of the system, such as
+        free: dotted names, or functions that pick leaves of the system, such as
             `lambda ik: ik.pelvis.limit`; a mapping of these has their `low`, `high`, `kind` and
             `scale`.
         system: with any rules; its values are fixed where they are not free. Or the name of a

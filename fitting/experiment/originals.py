@@ -74,7 +74,7 @@ TO_THE_RIGHT = Unit("m", (-1.0, 1.0, 1.0))  # Unity's x; ours is to the left
 
 
 class Setting(NamedTuple):
-    """A setting of an original, and what it is here."""
+    """A setting of an original, and its parameters here."""
 
     name: str
     ours: tuple[str, ...]
@@ -201,7 +201,7 @@ def to_settings(ik: jaxik.FootIK, name: str, *, drop: bool = False) -> dict[str,
     Args:
         ik: the system.
         name: of the original.
-        drop: whether to leave out, with a warning, what the original has no setting for.
+        drop: whether to leave out, with a warning, parameters without a setting.
 
     Raises:
         ValueError: there is no such original; the system has other rules than it, or values that it
@@ -224,7 +224,7 @@ def to_settings(ik: jaxik.FootIK, name: str, *, drop: bool = False) -> dict[str,
 
 
 def to_ik(values: Mapping[str, Value], name: str) -> jaxik.FootIK:
-    """The system of an original with these settings; what is left out has its default.
+    """The system of an original with these settings; others have their defaults.
 
     Raises:
         ValueError: there is no such original or setting, or a value has the wrong type or shape.

@@ -24,7 +24,7 @@ from .systems import DEFAULT_PRESET, Body, Preset
 
 @dataclass(frozen=True)
 class ParameterFile:
-    """What a parameter file has beside a table for each stage."""
+    """The keys of a parameter file beside a table for each stage."""
 
     rules: Mapping[str, str] = key({}, "Rules that differ from the preset's, by stage.")
     body: Body | None = key(None, "Whose numbers are meant where the file leaves them out.")

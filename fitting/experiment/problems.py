@@ -59,7 +59,7 @@ class LoadedExperiment(NamedTuple):
     clips: tuple[ClipData, ...]
     problem: Problem[jaxik.FootIK]
     known_values: Mapping[str, float] | None
-    """What made a synthetic reference, by dotted name."""
+    """The parameters of a synthetic reference, by dotted name."""
 
 
 @in_float64
@@ -131,7 +131,7 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
                 f"{experiment.path} [free]: {both} cannot be free: a track of {clip.base.source} "
                 "sets it in every frame"
             )
-    with activity.announced("Preparing what is compared"):
+    with activity.announced("Preparing the comparison"):
         for entry, clip in zip(experiment.clips, data, strict=True):
             clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
             held_out = _held_out(clip.reference, experiment, entry)

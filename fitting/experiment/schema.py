@@ -65,7 +65,7 @@ def experiment_schema() -> Content:
     return {
         "$schema": DIALECT,
         "title": "Experiment of jaxik",
-        "description": "What is fitted to what.",
+        "description": "Parameters of a system, and the clips to which they are fitted.",
         **schema,
         "properties": plain | properties,  # tables last, as in files
         "allOf": [only_originals(), *conditions()],
@@ -105,7 +105,7 @@ class Field(NamedTuple):
 
 
 def definitions() -> Content:
-    """What other schemas of this module refer to."""
+    """The schemas to which other schemas of this module refer."""
     return {
         "free": table_schema(systems.FREE_KEYS),
         "prior": table_schema(
@@ -161,7 +161,7 @@ def _with_captures(table: str) -> Content:
     tables, entry = of_free_parameters(table), {"$ref": f"#/$defs/{table}"}
     names = "|".join(parameter_tree.declarations(Capture()))
     pattern = {rf"^capture\.({names}){LEG}$": entry}
-    captures = capture(table) | {"description": "Of what is fitted of the captures."}
+    captures = capture(table) | {"description": "Of errors of the captures."}
     return tables | {
         "properties": tables["properties"] | {"capture": captures},
         "patternProperties": tables["patternProperties"] | pattern,
@@ -169,7 +169,7 @@ def _with_captures(table: str) -> Content:
 
 
 def only_originals() -> Content:
-    """That a faithful preset is one that differs from its original."""
+    """The condition that a faithful preset is one that differs from its original."""
     names = [preset.name for preset in systems.all_presets() if preset.faithful]
     faithful = {"properties": {"faithful": {"const": True}}, "required": ["faithful"]}
     return {"if": faithful, "then": {"properties": {"preset": {"enum": names}}}}
@@ -198,7 +198,7 @@ def conditions() -> list[Content]:
 
 
 def _by_default(preset: systems.Preset, stage: str) -> Content:
-    """That a file has the rule of a preset."""
+    """The condition that a file has the rule of a preset."""
     default = systems.DEFAULT_PRESET
     required = ["preset"] * (preset.name != default.name) + ["faithful"] * preset.faithful
     return {
@@ -209,13 +209,13 @@ def _by_default(preset: systems.Preset, stage: str) -> Content:
 
 
 def _nested(table: str, key: str, schema: Content) -> Content:
-    """That a table is there, with a key whose value meets a schema."""
+    """The condition that a table has a key whose value meets a schema."""
     inner = {"properties": {key: schema}, "required": [key]}
     return {"properties": {table: inner}, "required": [table]}
 
 
 def _only_names(stage: str, rule: eqx.Module) -> Content:
-    """That [parameters] and [free] have only fields of this rule in its stage."""
+    """The condition that [parameters] and [free] have only fields of this rule in its stage."""
     fields = [slot.name for slot in parameter_tree.slots(rule)] + [*parameter_tree.options(rule)]
     tables = {"parameters": (fields, ""), "free": ([*parameter_tree.declarations(rule)], LEG)}
     properties = {}

@@ -1,4 +1,4 @@
-"""The best fit of a problem, its posterior, and what the data determine of it.
+"""The best fit of a problem, its posterior, and the identifiability of its parameters.
 
 Everything here takes a `Problem` (`fitting.problem`) and returns numbers. Files, experiments and
 reports are elsewhere: `fitting.experiment`, `fitting.studies`, `fitting.report`.

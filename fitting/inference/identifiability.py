@@ -1,4 +1,4 @@
-"""What the data determine of a fit, and what they leave to the prior.
+"""Which parameters the data determine, and which they leave to the prior.
 
 Every parameter is judged by its profile: the lowest cost for each of its values, all others
 following. The Jacobian at the solution shows how parameters depend on each other.
@@ -163,7 +163,7 @@ def is_determined(profile: Profile, contraction: float) -> bool:
 
 @in_float64
 def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
-    """What the data of a problem determine around its solution.
+    """How well the data of a problem determine its parameters around the solution.
 
     The contraction of a parameter is `1 - (posterior width / prior width)²`, of 95 % intervals, on
     the scale on which its range is divided evenly.

@@ -189,7 +189,7 @@ def _numbered(labels: Sequence[str]) -> np.ndarray:
 
 
 class Estimate(NamedTuple):
-    """What the model says of centres and clips, given the spreads."""
+    """Centres and clips by the model, given the spreads."""
 
     centre: Float[np.ndarray, " parameters"]
     clips: Float[np.ndarray, "clips parameters"]
@@ -230,7 +230,7 @@ class Draws(NamedTuple):
 
 
 class _Conditional(NamedTuple):
-    """What the data say of the spread of one parameter, given the others: `log_density`."""
+    """The density of the spread of one parameter, given the others."""
 
     information: np.ndarray  # of the groups' deviations, along its eigenvectors
     score: np.ndarray  # of them, at 0, squared
@@ -274,7 +274,7 @@ class _Conditional(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class MixedModel:
-    """Clips with quadratic likelihoods, and the prior of what they share."""
+    """Clips with quadratic likelihoods, and the prior of their centres and spreads."""
 
     grouping: Grouping
     information: Float[np.ndarray, "clips parameters parameters"]
@@ -392,7 +392,7 @@ class MixedModel:
         return precision, shifted, scale
 
     def _conditional(self, k: int, spreads: Spreads) -> _Conditional:
-        """What the data say of one spread, all deviations of others integrated out."""
+        """The density of one spread, all deviations of others integrated out."""
         own = np.concatenate([np.zeros(self._size, bool), self._owners == k])
         as_deviations = np.where(np.arange(self._size) == k, 1.0, spreads)
         precision, vector, _ = self._posterior(as_deviations)
@@ -553,12 +553,12 @@ class _State:
     deviations: Points
     """Of each clip from the centre; 0 where shared."""
     likelihoods: Likelihoods
-    """There."""
+    """At these points."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Search:
-    """What stays the same in a search."""
+    """The constants of a search."""
 
     problems: Sequence[Problem]
     space: Space

@@ -68,8 +68,8 @@ class NoiseOptions(Table):
     """Which properties of the noise are estimated from the residuals, kind by kind.
 
     By default the best point is where the residuals in units of the given sigmas are smallest, and
-    what is estimated only decides how wide intervals are. Estimated sigmas and whitened residuals
-    move the best point: right for noise that the system leaves, and wrong for what it cannot
+    estimates only decide how wide intervals are. Estimated sigmas and whitened residuals move the
+    best point: right if the residuals are noise, and wrong for motion that the system cannot
     follow, which then counts as noise. The tails of the loss `student` are estimated together with
     the sigmas.
 
@@ -91,7 +91,7 @@ class NoiseOptions(Table):
 
     @property
     def moves_optimum(self) -> bool:
-        """Whether what is estimated decides where the best point is."""
+        """Whether the estimates decide where the best point is."""
         return self.sigmas == "estimated" or self.correlation == "whitened"
 
     @property
@@ -176,12 +176,12 @@ def information_of_slopes(loss: Loss, tails: float) -> float:
 
 
 def innovations(errors: Errors, correlation: float) -> Float[np.ndarray, " values"]:
-    """What the previous frame does not predict, of the errors that count, in their unit."""
+    """The part of the errors that count that the previous frame does not predict, in their unit."""
     return whitened(errors, correlation).values[errors.active]
 
 
 def whitened(errors: Errors, correlation: float) -> Errors:
-    """What the previous frame does not predict of errors, where there is one that counts."""
+    """Errors less their prediction by the previous frame, where there is one that counts."""
     values, follows = errors.values, _follows(errors)
     previous = np.concatenate([np.zeros_like(values[:1]), values[:-1]])
     innovation = (values - correlation * previous) / math.sqrt(1 - correlation**2)
@@ -248,7 +248,7 @@ class NoiseModel:
             raise ValueError(f"{self}; wanted correlations between -1 and 1")
 
     def change_from(self, other: "NoiseModel") -> float:
-        """The largest change: relative of a sigma, of a correlation relative to what is left."""
+        """The largest change: relative for sigmas, over 1 less its square for a correlation."""
         changes = [abs(math.log(self.sigmas[kind] / other.sigmas[kind])) for kind in self.sigmas]
         changes += [
             abs(rho - other.correlations[kind]) / (1 - rho**2)
@@ -290,7 +290,7 @@ def _with_noise(scene: Scene, noise: NoiseModel) -> Scene:
 
 @in_float64
 def likeliest_noise(problem: Problem[jaxik.FootIK], u: Vector, options: NoiseOptions) -> NoiseModel:
-    """The noise that makes the errors at `u` likeliest; what is not estimated stays as it is.
+    """The noise that makes the errors at `u` likeliest; properties not estimated stay.
 
     Raises:
         NoiseCollapse: the likeliest sigma of a kind is less than any capture has.
@@ -331,15 +331,15 @@ def _check_noise(sigmas: Mapping[str, float]) -> None:
         if sigma < (least := LEAST_SIGMAS[kind]):
             raise NoiseCollapse(
                 f"the noise of {kind} has collapsed: its likeliest sigma is {sigma:.2g}, and no "
-                f"capture is known to less than {least:g} (m, rad); what the system cannot follow "
-                'passed for correlated noise, or nothing is left: set sigmas = "given" and '
+                f"capture is known to less than {least:g} (m, rad); motion that the system cannot "
+                'follow passed for correlated noise, or nothing is left: set sigmas = "given" and '
                 'correlation = "counted" in [noise]'
             )
 
 
 @in_float64
 def measured(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]:
-    """The problem with the noise that its residuals at `u` show, for what is predicted of them."""
+    """The problem with the noise of its residuals at `u`, from which replicates are predicted."""
     noise, by_clip = noise_of(problem), _errors_of_clips(problem, u)
     estimates = {
         kind: likeliest([e[kind] for e in by_clip], problem.loss, noise.tails, None)

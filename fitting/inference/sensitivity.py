@@ -1,13 +1,13 @@
-"""Which parameters change a motion at all, and which to free before anything is known.
+"""Which parameters change a motion at all, and which to free before a fit.
 
 Each parameter is swept over its range while the others stay at the system's values, and again at a
 few draws from a wide prior, for at one point a rule may happen to be idle. The mean slope of every
 residual over such a sweep, which also sees what lies behind a threshold or a limit, stands in for
 its derivative, and a normal approximation then shows how far the clips would narrow down the
 parameters together. The one they narrow down least is fixed, and so on, until they narrow down all.
-It is a forecast: what the clips do determine is for the fit to say.
+It is a forecast: the fit shows what the clips do determine.
 
-On flat ground a capture says nothing but that foot IK must not move the feet. Where a system moves
+On flat ground a capture only shows that foot IK must not move the feet. Where a system moves
 them, the parameter whose change helps most is changed, then the next one, up to `MOST` of them,
 which are for a fit to refine.
 """
@@ -129,7 +129,7 @@ def _residuals_of_batch(space: Space, scenes: tuple[Scene, ...], candidates: Arr
 
 @dataclasses.dataclass(frozen=True)
 class Forecast:
-    """What the clips are expected to say of a parameter."""
+    """How well the clips are expected to determine a parameter."""
 
     name: str
     is_free: bool

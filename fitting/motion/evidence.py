@@ -167,7 +167,7 @@ def describe_missing_motion(
     if active is not None:
         frames = f"it acts in {100 * active:.1f} % of the frames"
         return f"motion that reaches this limit ({frames}): {doc}"
-    return f"not known; what it does: {doc}"
+    return f"not known; its effect: {doc}"
 
 
 def _filled(phrase: str, figure: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Flat animations: what a game would play on flat ground, derived from a clip on uneven ground.
+"""Flat animations, as a game plays them on flat ground, derived from a clip on uneven ground.
 
 Foot IK takes such an animation and the terrain, and should return the captured motion. To derive
 it, the terrain is removed from under the feet: during a stance a foot is lowered by the height of

@@ -2,7 +2,7 @@
 
 Three motions are compared on the same frames: the flat animation without foot IK, the system as it
 was before the fit, and the fitted one. Distances are root mean squares over frames and legs. Frames
-that were held out say what the parameters are worth on motion that they were not fitted to.
+that were held out test the parameters on motion to which they were not fitted.
 
 The verdict rests on size and autocorrelation of the residuals, each with its significance.
 Residuals come in standard deviations, frames first and a column for each leg and component, which
@@ -34,7 +34,7 @@ Kinds: TypeAlias = Mapping[str, float]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 PARTS: tuple[Part, ...] = get_args(Part)
 
-# Distances up to which two motions look the same, m and rad: what a good fit of a capture leaves.
+# Distances up to which two motions look the same, m and rad, as after a good fit of a capture.
 CLOSE = {"ankle": 0.02, "knee": 0.03, "pelvis": 0.02, "foot": 0.1}
 # Differences between two distances that nobody sees, m and rad: 2 mm, of a foot at heel and tip.
 UNSEEN = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": math.radians(1.0)}
@@ -48,7 +48,7 @@ LARGEST = 3.0  # sigmas, to which residuals are clipped where outliers are expec
 
 NEAR, FAR = 3.0, 5.0  # sigmas beyond which residuals are counted
 MANY_OUTLIERS = 0.005  # fraction beyond FAR; a normal has 6e-7, noise of Student's t with 4.4 this
-LONGEST_OUTLIER = 3  # frames; what is far off for longer is a misfit
+LONGEST_OUTLIER = 3  # frames; residuals far off for longer are a misfit
 MIN_SEEN = 0.5  # fraction of a stretch that must have been observed
 
 SIGNIFICANT = 1e-3  # p-value, over all groups, above which nothing is a finding
@@ -179,7 +179,7 @@ class Noise:
     count: int
     """Active residuals."""
     degrees: float
-    """Of freedom: independent values in the mean of the squares, less what the fit used up."""
+    """Of freedom: independent values in the mean of the squares, less those used by the fit."""
     mean_square: float
     """Reduced chi-square: 1 where the sigma is right."""
     autocorrelation: float
@@ -336,7 +336,7 @@ EXPECTED = {size: float(2 * special.ndtr(-size)) for size in (NEAR, FAR)}  # fra
 
 @dataclass(frozen=True)
 class Assumed:
-    """What a fit assumes of its residuals, apart from their sigmas."""
+    """The assumptions of a fit about its residuals, apart from their sigmas."""
 
     loss: Loss = "squares"
     weight: float = 1.0
@@ -380,9 +380,9 @@ class Group:
     """From 0."""
     kind: str
     sigma: float
-    """That was given; m, rad, ..."""
+    """As the user set it; m, rad, ..."""
     correlation: float
-    """From frame to frame, that was given."""
+    """From frame to frame, as the user set it."""
     dt: float
     """s, of a frame."""
     plain: Noise

@@ -576,7 +576,7 @@ class Cause(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What it is, and what to do."""
+        """The cause, and its remedy."""
         side = "high" if self.amount > 0 else "low"
         return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side)
 

@@ -91,7 +91,7 @@ class Playback(eqx.Module):
     seen: Bool[Series, " frames"]
     """False in frames that the fit leaves out."""
     held_out: Bool[Series, " frames"]
-    """True in those that it leaves out to show what it is worth."""
+    """True in frames that it leaves out to test itself."""
     present: Bool[Series, " legs"]
     """False for legs that the rig only has in name."""
     errors: Mapping[str, Float[Series, "frames_of_kind ..."]]
@@ -102,7 +102,7 @@ class Playback(eqx.Module):
     """As the fit sees them, in sigmas."""
     sigmas: Mapping[str, Float[Series, ""]]
     label: str = eqx.field(static=True)
-    """What pictures call the captured motion."""
+    """The name of the captured motion in pictures."""
 
     @cached_property
     def time(self) -> Float[np.ndarray, " frames"]:

@@ -1,4 +1,4 @@
-"""What a fit minimises and a sampler draws from.
+"""The problem that a fit minimises and a sampler draws from.
 
 A `Problem` joins three things: the `Space` of free parameters, the data, and the function that
 gives residuals in standard deviations. It knows nothing of how the minimum is found or the

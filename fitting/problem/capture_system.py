@@ -162,8 +162,8 @@ def delayed(
 ) -> Float[Array, " frames *shape"]:
     """Numbers of each frame as they were the capture's time shift before.
 
-    Cubic between frames (Catmull and Rom 1974), so that derivatives have no jumps; what was before
-    a clip or comes after it counts as at its end.
+    Cubic between frames (Catmull and Rom 1974), so that derivatives have no jumps; before and after
+    a clip the numbers are those at its ends.
     """
     places, weights = _taps(capture, frames)
     return _mixed([values[place] for place in places], weights)
@@ -211,7 +211,7 @@ class RaisedSurface(AbstractSurface):
     height: Float[Array, ""]
     """Metres."""
     slope_ws: Float[Array, "3"]
-    """m/m, at right angles to up: what the height gains along each axis of the world."""
+    """m/m, at right angles to up: the gain in height along each axis of the world."""
 
     @property
     def platform(self) -> int:

@@ -61,7 +61,7 @@ def apply_loss(
 
 
 def rho(z: Squares, loss: Loss, tails: Number = TAILS, library: ModuleType = jnp) -> Squares:
-    """What the loss makes of squared residuals `z`, in sigmas."""
+    """The loss of squared residuals `z`, in sigmas."""
     return z * _factor_and_slope(z, loss, tails, library)[0]
 
 

@@ -131,7 +131,7 @@ def whitened(
     correlation: Float[Array, "*#frames"],
     begins: Bool[np.ndarray, " frames"] | None = None,
 ) -> Float[Array, " frames *r"]:
-    """Residuals minus what the previous frame predicts of them, in units of what remains.
+    """Residuals less their prediction by the previous frame, in sigmas of the remainder.
 
     `(r_t - rho r_{t-1}) / sqrt(1 - rho²)` where both frames were observed, `r_t` where only this
     one was, 0 where it was not. They are independent if the errors are a first-order

@@ -134,9 +134,9 @@ class Reference(eqx.Module):
     observed: Bool[Array, " frames"]
     """False where a marker jumped or nothing was captured, and in frames that are held out."""
     held_out: Bool[Array, " frames"]
-    """True where the capture was observed, and is not fitted but shows what a fit is worth."""
+    """True where the capture was observed, and is not fitted but tests the fit."""
     label: str = eqx.field(static=True, default="captured")
-    """What plots call it."""
+    """Its name in plots."""
 
 
 class Place(eqx.Module):

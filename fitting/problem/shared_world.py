@@ -7,8 +7,8 @@ starts anew at the first frame of each clip. Foot IK is the same wherever a worl
 Terrains that are not static meshes can be shared only by clips that have the same one.
 
 Side by side, clips of different length are one array. A clip is made longer by repeating its last
-frame, which then was not observed: nothing that a frame shows depends on later ones, and what was
-not observed has no residuals. Lengths are rounded up to a few, so that a thousand clips of a
+frame, which then counts as not observed: no frame depends on later ones, and frames that were not
+observed have no residuals. Lengths are rounded up to a few, so that a thousand clips of a
 thousand lengths need a few programs.
 """
 

@@ -9,7 +9,7 @@ logarithm of its half-life up to a constant, so that the tick rate cancels. `flo
 bound, or, for a parameter declared above another one, the larger of that bound and the other one's
 value: the order holds for every `u`. `start` is where a search begins.
 
-`prior` is what is known before any data, of each parameter independently, in one of two shapes:
+`prior` is the knowledge before any data, of each parameter independently, in one of two shapes:
 
     normal     log density = -½ ((u - centre) / spread)²          up to a constant
     uniform    log density = -2 log cosh(u / 2)                   up to a constant
@@ -573,7 +573,7 @@ class Space(eqx.Module, Generic[System]):
 
 
 def _shape(space: Space, name: str) -> tuple[int, ...]:  # no method: binding one takes 0.3 ms
-    """That of a leaf in the system: empty, or a value for each leg."""
+    """The shape of a leaf in the system: empty, or a value for each leg."""
     return parameter_tree.get(space.system, name).shape
 
 

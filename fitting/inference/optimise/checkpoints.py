@@ -2,8 +2,8 @@
 
 A stage follows from the state before it and from nothing else that changes. So a search that is
 begun again takes the ends of its first stages from the file, in their order, and computes the
-others: what comes out is to the last bit what the search would have found in one go. Jacobians are
-computed again, where they are needed.
+others: the result is to the last bit that of a search without interruption. Jacobians are computed
+again, where they are needed.
 
 A fit makes several searches: each has its own list of stages, under a digest of all that it follows
 from. Of the profiles of a solution only the last stage is stored, which holds all before it. The

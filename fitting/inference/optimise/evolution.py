@@ -223,7 +223,7 @@ def residuals(
 def _of_batches(
     call: Callable[[Array], Sequence[Array]], candidates: np.ndarray
 ) -> list[np.ndarray]:
-    """What a call gives of all candidates, computed BATCH at a time; 64-bit floats.
+    """The outputs of a call for all candidates, computed BATCH at a time; 64-bit floats.
 
     The last batch is filled up, so that there is one program. It runs on one core, so batches share
     the cores out among themselves.

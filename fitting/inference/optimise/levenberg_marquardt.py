@@ -122,7 +122,7 @@ class LMState(eqx.Module):
     trial: Float[Array, " free"]
     """The point that the next step evaluates."""
     search: PyTree
-    """What the search remembers, which only the search itself reads."""
+    """The memory of the search, which only the search itself reads."""
 
     @property
     def jacobian(self) -> Float[Array, "residuals free"]:

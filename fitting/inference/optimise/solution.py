@@ -1,4 +1,4 @@
-"""What the stages of a search hand on to each other, its reports while it runs, and its result.
+"""The settings and the state of a search, its reports while it runs, and its result.
 
 Every stage is a function `(search, state, ...) -> state`. A `Search` is what stays the same, a
 `SearchState` what changes. Stages change neither: called again with the same state they do the
@@ -78,7 +78,7 @@ class Solution:
     """Of Levenberg–Marquardt, all starts together."""
     seconds: float
     starts: int = 1
-    """That were finished."""
+    """Finished ones."""
     agreeing: int = 1
     """Of them, those that ended at this cost, or hardly above it."""
     agreed: bool = False
@@ -273,7 +273,7 @@ Stage: TypeAlias = Callable[[], SearchState]
 
 @dataclasses.dataclass
 class Search:
-    """What all stages of a search share."""
+    """A problem, settings and callbacks, which all stages of a search share."""
 
     problem: Problem
     settings: SearchSettings = DEFAULTS
@@ -282,7 +282,7 @@ class Search:
     recall: Callable[["Search", str, SearchState, Stage], SearchState] | None = None
     """Gives the state in which a stage ended before the search was killed, or calls the stage."""
     latest: SearchState | None = None
-    """That was reported last; an interrupted search ends there."""
+    """The last reported state; an interrupted search ends there."""
 
     @property
     def thresholds(self) -> np.ndarray:

@@ -37,8 +37,8 @@ MOVES = (0.05, 0.5)  # size of random moves, in standard deviations of Laplace's
 FURTHEST = 4.0  # of u: no parameter follows further than that in one step
 
 SECANT_STEPS = 2.0 ** -np.arange(14)  # of u, each twice the next
-CHANGE = 2.0  # of the residuals, half their square: what a step should bring
-CHANGES = (0.3, 20.0)  # and may bring
+CHANGE = 2.0  # of the residuals, half their square, that a step should cause
+CHANGES = (0.3, 20.0)  # and may cause
 GRADUAL = (0.15, 0.4)  # change in half a step over that in a whole one, a quarter if proportional
 
 

@@ -1,4 +1,4 @@
-"""The profile of one parameter, and what it says: minima, interval and verdict.
+"""The profile of one parameter, and its reading: minima, interval and verdict.
 
 Near its lowest point a profile is a parabola, and half a quantile of chi-square is right for how
 far it rises within an interval (1.92 for 95 %). The profile of a limit that a clip hardly reaches

@@ -153,7 +153,7 @@ def _single_moves(
 
 @dataclasses.dataclass
 class Profiling:
-    """What the stages share; they add to the curves."""
+    """The state of a profiling, to which its stages add."""
 
     conditional: Conditional
     solution: Points

@@ -1,4 +1,4 @@
-"""The posterior: an ensemble of walkers of emcee, its chain, and what the chain says.
+"""The posterior: an ensemble of walkers of emcee, its chain, and the chain's diagnostics.
 
 `posterior` runs it from a solution to a result. `blocks` splits the parameters that are moved
 together, `sampler` moves them, `chain` stores and resumes them, `modes` finds walkers that stay

@@ -1,8 +1,8 @@
-"""The log-likelihood of blocks of frames, and what it says of motion that was not fitted.
+"""The log-likelihood of blocks of frames, and predictions of blocks that are left out.
 
-Leaving out one block after another shows how well a fit predicts what it has not seen. The chain is
-not sampled again: its draws are weighted (Pareto-smoothed importance sampling; Vehtari, Gelman and
-Gabry 2017). Blocks, and not frames, because what one frame misses its neighbours give away.
+Leaving out one block after another shows how well a fit predicts motion that it has not seen. The
+chain is not sampled again: its draws are weighted (Pareto-smoothed importance sampling; Vehtari,
+Gelman and Gabry 2017). Blocks, and not frames, because a frame is known from its neighbours.
 """
 
 import dataclasses

@@ -38,7 +38,7 @@ WINDOW = 5.0  # autocorrelation times to sum over (Sokal 1997, Monte Carlo metho
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """What a run must have in common with a chain to continue it."""
+    """The settings that a run must share with a chain to continue it."""
 
     parameters: tuple[str, ...]
     walkers: int
@@ -112,7 +112,7 @@ def read_chain(path: Path, current: Identity) -> StoredChain:
 
 
 def random_state(keys: Any, position: Any, has_gauss: Any, gauss: Any) -> RandomState:
-    """The generator's state from what a file holds of it.
+    """The generator's state from its parts in a file.
 
     Raises:
         ValueError: no generator has such a state.

@@ -1,4 +1,4 @@
-"""How far a chain can be trusted, and what it says. Plain NumPy; steps are stored steps."""
+"""The convergence of a chain and its summary. Plain NumPy; steps are stored steps."""
 
 import dataclasses
 import math
@@ -54,7 +54,7 @@ def isolated_walkers(
 
 
 def lazy_walkers(acceptance: Float[np.ndarray, " walkers"]) -> Bool[np.ndarray, " walkers"]:
-    """Walkers that accept less than a tenth of what the median walker accepts."""
+    """Walkers that accept less than a tenth of the proposals that the median walker accepts."""
     return acceptance < LAZY * np.median(acceptance)
 
 
@@ -102,7 +102,7 @@ def summarise(
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """What the first `length` steps of a chain look like."""
+    """The state of the first `length` steps of a chain."""
 
     length: int
     times: Float[np.ndarray, " free"]

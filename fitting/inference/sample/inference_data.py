@@ -1,6 +1,6 @@
 """A posterior for ArviZ: its plots, its diagnostics and NetCDF files.
 
-ArviZ is optional; `pip install "jaxik[posterior]"` brings what is used here.
+ArviZ is optional; `pip install "jaxik[posterior]"` installs it.
 """
 
 import warnings

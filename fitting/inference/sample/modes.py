@@ -153,7 +153,7 @@ class Mode:
     exchanges: int
     """How often a walker came or left."""
     walkers: int
-    """That are there at the end."""
+    """Number of walkers in the mode at the end."""
     log_probability: float
     """The highest one there."""
 

@@ -87,7 +87,7 @@ class Posterior(Shown):
     """Walkers that never come near the others, in modes of negligible weight; left out of the
     summary."""
     stuck: list[int]
-    """Those, and walkers that hardly ever move."""
+    """Isolated walkers, and walkers that hardly ever move."""
     converged: bool
     message: str
     """One sentence."""
@@ -172,7 +172,7 @@ def sample_posterior(
     returns it, unless no step is done.
 
     Args:
-        problem: what is free, and the data.
+        problem: with free parameters and data.
         start: where the walkers start.
         settings: how long to sample.
         seed: of the start and of every proposal.
