@@ -309,12 +309,6 @@ class MixedModel:
         prior = float(np.sum(np.square(spreads / self.spread_scale)))
         return -float(np.sum(np.log(np.diag(lower)))) - 0.5 * prior
 
-    def log_marginal(self, spreads: Spreads) -> float:
-        """Log-probability of spreads, up to a constant, all else integrated out."""
-        precision, vector, _ = self._posterior(spreads)
-        at_mode = float(vector @ linalg.solve(precision, vector, assume_a="pos"))
-        return 0.5 * at_mode + self.log_volume(spreads)
-
     def estimate(self, spreads: Spreads) -> Estimate:
         """Means and standard deviations, given the spreads."""
         precision, vector, scale = self._posterior(spreads)

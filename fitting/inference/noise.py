@@ -198,7 +198,7 @@ def scale(values: Float[np.ndarray, " values"], loss: Loss, tails: float) -> flo
         if not variance > 0:
             break
         before, squares = variance, values**2
-        weights = slope_of_rho(squares / variance, loss, tails, np)
+        weights = slope_of_rho(squares / variance, loss, tails)
         variance = float(np.mean(weights * squares))
         if abs(variance - before) <= TOLERANCE * before:
             break
@@ -213,7 +213,7 @@ def log_density(
     if loss == "student":
         constant = special.gammaln((tails + 1) / 2) - special.gammaln(tails / 2)
         constant -= 0.5 * math.log(math.pi * tails)
-    return np.asarray(constant - 0.5 * rho(residuals**2, loss, tails, np))
+    return np.asarray(constant - 0.5 * rho(residuals**2, loss, tails))
 
 
 def _follows(errors: Errors) -> Bool[np.ndarray, "frames columns"]:
@@ -402,7 +402,7 @@ def likelihood_weight(
 
 def _influence(problem: Problem[jaxik.FootIK], residuals: np.ndarray) -> np.ndarray:
     """Derivative of half the loss by a residual, both in sigmas."""
-    return residuals * slope_of_rho(residuals**2, problem.loss, float(problem.tails), np)
+    return residuals * slope_of_rho(residuals**2, problem.loss, float(problem.tails))
 
 
 def _errors_of_clips(problem: Problem[jaxik.FootIK], u: Vector) -> list[dict[str, Errors]]:

@@ -241,4 +241,4 @@ def leave_alone(
 
 def _cost(residuals: Float[np.ndarray, " residuals"]) -> float:
     """As a fit counts it, without the prior."""
-    return 0.5 * float(np.sum(rho(residuals**2, "huber", library=np)))
+    return 0.5 * float(np.sum(rho(residuals**2, "huber")))

@@ -5,8 +5,7 @@ back for each point, the sum over all devices. It is that of one device up to ro
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -41,16 +40,14 @@ class ShardedScenes(eqx.Module):
     """The devices."""
 
 
-def over_devices(
-    problem: Problem[jaxik.FootIK], devices: Sequence[Any] | None = None
-) -> Problem[jaxik.FootIK]:
-    """The problem with its clips shared out among devices; the same up to rounding.
+def over_devices(problem: Problem[jaxik.FootIK]) -> Problem[jaxik.FootIK]:
+    """The problem with its clips shared out among the process's devices; the same up to rounding.
 
     Its residuals come in another order, with zeros where clips were made longer or devices have
     less to do. With one device or one clip, a capture that is fitted, or residuals of another
-    kind, it stays as it is. By default the devices are all those of this process.
+    kind, it stays as it is.
     """
-    devices = jax.local_devices() if devices is None else list(devices)
+    devices = jax.local_devices()
     if (
         len(devices) < 2
         or problem.residual_function is not residuals_of_scenes

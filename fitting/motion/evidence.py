@@ -101,14 +101,14 @@ def _frame_costs(
     weight, tails = float(problem.weight), float(problem.tails)
 
     def costs(frames: int, residuals: np.ndarray) -> np.ndarray:
-        squares = np.asarray(residuals).reshape(len(residuals), -1) ** 2
-        of_loss = rho(squares, problem.loss, tails, np)
+        squares = residuals.reshape(len(residuals), -1) ** 2
+        of_loss = rho(squares, problem.loss, tails)
         missing = frames - len(residuals)  # an acceleration has no first and no last frame
         sides = missing // 2, missing - missing // 2
         return weight * np.pad(0.5 * of_loss.sum(axis=1), sides)
 
     return [
-        {kind: costs(len(playback.dt), values) for kind, values in playback.residuals.items()}
+        {kind: costs(len(playback.dt), np.asarray(r)) for kind, r in playback.residuals.items()}
         for playback in playbacks
     ]
 

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, PyTree
 from fitting.runtime.precision import in_float64
 from jaxik import lanes
 
-from .space import Space, System, Vector
+from .space import Space, System, Vector, library_of
 
 HUBER = 1.345  # sigmas; 95 % efficient for normal errors (Holland and Welsch 1977)
 CAUCHY = 2.385  # sigmas; 95 % efficient, too
@@ -60,16 +60,14 @@ def apply_loss(
     return residuals * jnp.sqrt(factor)
 
 
-def rho(z: Squares, loss: Loss, tails: Number = TAILS, library: ModuleType = jnp) -> Squares:
+def rho(z: Squares, loss: Loss, tails: Number = TAILS) -> Squares:
     """The loss of squared residuals `z`, in sigmas."""
-    return z * _factor_and_slope(z, loss, tails, library)[0]
+    return z * _factor_and_slope(z, loss, tails, library_of(z))[0]
 
 
-def slope_of_rho(
-    z: Squares, loss: Loss, tails: Number = TAILS, library: ModuleType = jnp
-) -> Squares:
+def slope_of_rho(z: Squares, loss: Loss, tails: Number = TAILS) -> Squares:
     """Derivative of `rho` by `z`: how much a residual counts, compared with squares."""
-    return _factor_and_slope(z, loss, tails, library)[1]
+    return _factor_and_slope(z, loss, tails, library_of(z))[1]
 
 
 def _factor_and_slope(

@@ -386,16 +386,12 @@ def padded(scene: Scene, frames: int) -> Scene:
     )
 
 
-def stack(scenes: Sequence[Scene], *, rounded: bool = True) -> list[Stack]:
-    """Clips in as few stacks as their shapes allow, each with clips in their order.
-
-    Their lengths are rounded up to a few, or else to that of the longest clip.
-    """
-    longest = max(map(frame_count, scenes))
+def stack(scenes: Sequence[Scene]) -> list[Stack]:
+    """Clips in as few stacks as their shapes allow, each with clips in their order."""
     groups: dict[object, list[tuple[int, Scene]]] = {}
     for number, scene in enumerate(scenes):
-        length = rounded_up(frame_count(scene)) if rounded else longest
-        plain = _without_names(dataclasses.replace(padded(scene, length), place=None))
+        longer = padded(scene, rounded_up(frame_count(scene)))
+        plain = _without_names(dataclasses.replace(longer, place=None))
         groups.setdefault(_shapes(plain), []).append((number, plain))
     return [_stacked(members) for members in groups.values()]
 

@@ -139,7 +139,10 @@ def free_parameter(
     usual = bounds | {"kind": declaration.kind, "scale": declaration.scale}
     values: Any = usual | check_table(overrides, keys(Override), name)
     present_value(ik, name)  # raises for a leg that does not exist
-    parameter = FreeParameter(name=name, above=_absolute(declaration.above, leaf), **values)
+    above = declaration.above  # a field of the same rule
+    if above is not None and "." in leaf:
+        above = f"{leaf.rpartition('.')[0]}.{above}"
+    parameter = FreeParameter(name=name, above=above, **values)
     _check(parameter, declaration)
     return parameter
 
@@ -172,13 +175,6 @@ def present_value(ik: eqx.Module, name: str) -> float:
         hint = f"there are {elements}" if elements else "it is shared by the legs"
         raise ValueError(f"no element {name!r}: {hint}")
     return float(value[int(rest[:-1])])
-
-
-def _absolute(above: str | None, leaf: str) -> str | None:
-    """Dotted name of a field that is declared by its name within the rule of `leaf`."""
-    if above is None or "." not in leaf:
-        return above
-    return f"{leaf.rpartition('.')[0]}.{above}"
 
 
 def _check(parameter: FreeParameter, declaration: parameter_tree.Declaration) -> None:
@@ -254,14 +250,9 @@ def from_fractions(
     return from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
 
 
-def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
-    """The half-life, s, of a gain per tick, and the gains with the same half-life at other rates.
-
-    Args:
-        gain: fraction of the distance to its target that a value moves in each tick.
-        tick_hz: ticks per second.
-    """
-    per_tick, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
+def gain_readings(gain: float) -> dict[str, float]:
+    """The half-life, s, of a gain per tick of 1/30 s, and its equivalents at other rates."""
+    per_tick, rate = jnp.asarray(gain), jnp.asarray(30.0)
     readings = {"half_life": float(smoothing.half_life_of_gain(per_tick, rate))}
     for hz in TICK_RATES:
         fraction = smoothing.fraction_of_gain(per_tick, jnp.asarray(1.0 / hz), rate)

@@ -204,7 +204,7 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
     def student(pelvis: Any, knee: np.ndarray, ankle: Any) -> np.ndarray:
         positions = np.concatenate([pelvis.pos[:, :, None], knee, ankle.pos], axis=2)
         distances = (positions - positions[-1]) / POSITION
-        losses = np.asarray(rho(distances**2, "student", tails, np))
+        losses = np.asarray(rho(distances**2, "student", tails))
         return 0.5 * losses.sum(axis=(1, 2, 3))
 
     profile = profile_of("record", "pelvis.limit", clip, ground, student)

@@ -96,7 +96,7 @@ MISTAKES = {
         ("pelvis.on_gain = 3", "pelvis.on_gain is 3; wanted a table"),
         ("pelvis.on_gain = { lo = 1 }", "unknown key 'lo'; nearest is 'low'"),
         ("pelvis.on_gain = { low = 'x' }", "low is 'x'; wanted a finite number"),
-        ("pelvis.on_gain = { prior_sd = 1 }", r"prior_sd is no key .*.prior.*{ spread = 1 }"),
+        ("pelvis.on_gain = { prior_sd = 1 }", r"prior_sd is not a key .*.prior.*{ spread = 1 }"),
         ("pelvis.on_gain = { kind = 'rough' }", "kind is 'rough'; wanted one of"),
         ("pelvis.on_gian = {}", r"\[free\]: no parameter named 'pelvis.on_gian'; nearest is"),
         ("lock.enabled = {}", "no parameter named 'lock.enabled'"),

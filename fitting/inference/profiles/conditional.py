@@ -82,7 +82,7 @@ class Conditional:
     random: np.random.Generator
 
     @classmethod
-    def around(cls, problem: Problem, solution: Solution, seed: int = 0) -> "Conditional":
+    def around(cls, problem: Problem, solution: Solution) -> "Conditional":
         """The normal equations at a solution."""
         smooth = np.asarray(problem.space.smooth)
         of_thresholds = slopes_of_thresholds(problem, np.asarray(solution.u))
@@ -90,8 +90,7 @@ class Conditional:
         sloping = np.ix_(*[np.diag(slopes.gram) > 0] * 2)
         spread = np.zeros_like(slopes.gram)
         spread[sloping] = np.linalg.inv(np.linalg.cholesky(slopes.gram[sloping])).T
-        random = np.random.default_rng(seed)
-        return cls(problem, np.asarray(solution.u), slopes, spread, random)
+        return cls(problem, np.asarray(solution.u), slopes, spread, np.random.default_rng(0))
 
     @property
     def gram(self) -> Float[np.ndarray, "free free"]:
@@ -146,12 +145,10 @@ class Conditional:
         values[rows, targets.index] = targets.value
         return space.pack_values(values)
 
-    def lowest(
-        self, targets: Targets, starts: Sequence[Points], *, descending: bool = True
-    ) -> Points:
+    def lowest(self, targets: Targets, starts: Sequence[Points]) -> Points:
         """The lowest point found at each target, from some starts for each.
 
-        Where that is far from the solution, a descent may follow.
+        Where that is far from the solution, a descent follows.
         """
         base, owner = join(starts), np.repeat(np.arange(len(starts)), [len(s.cost) for s in starts])
         gradient = np.zeros_like(base.u)  # near their own optimum, the targets apart
@@ -171,7 +168,7 @@ class Conditional:
             lowest = base
         assert lowest is not None
         far = ~self._near(lowest.u) & np.isfinite(lowest.cost)
-        return self.descend_each(lowest, targets, far) if descending else lowest
+        return self.descend_each(lowest, targets, far)
 
     def _choose(
         self, cost: np.ndarray, owner: np.ndarray, targets: int

@@ -50,7 +50,7 @@ NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpol
 NARROW = 0.05  # fraction of a minimum's width that its ends are found to
 
 
-def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> Points:
+def other_plateaus(conditional: Conditional, curves: Curves) -> Points:
     """The best points on other plateaus of the thresholds, near in cost to the solution.
 
     The thresholds of children are drawn from those along the thresholds' curves, independently of
@@ -58,7 +58,7 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
     """
     space = conditional.problem.space
     thresholds = [int(i) for i in np.flatnonzero(space.thresholds)]
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     along = {i: curves.curves[i][curves.rises(i) < CLOSE] for i in thresholds}
     candidates = [along[i] for i in thresholds]
     for _ in range(GENERATIONS if len(thresholds) > 1 else 0):
