@@ -70,7 +70,7 @@ def test_draws_have_their_walkers_steps_units_and_kinds(posterior, tree):
     draws = tree["posterior"]
     assert draws["chain"].values.tolist() == [0, 1, 2, 3, 4, 6, 7]
     assert draws["draw"].values[[0, -1]].tolist() == [202, 600]
-    np.testing.assert_array_equal(draws["foot.limit[0]"].T, posterior.kept[..., 1])
+    np.testing.assert_array_equal(draws["foot.limit[0]"].T, posterior.draws[..., 1])
     assert draws["foot.limit[0]"].attrs["units"] == "rad"
     assert draws["lock.height_on"].attrs["kind"] == "threshold"
     lp = tree["sample_stats"]["lp"]

@@ -57,7 +57,7 @@ def test_modes_get_their_exact_weights_from_unbalanced_starts():
     assert heavy.error < 0.025
     assert abs(heavy.weight - 0.8) < 4 * heavy.error
     assert light.weight == pytest.approx(1 - heavy.weight)
-    there = sampled.kept_u[..., 0] > 0
+    there = sampled.draws_u[..., 0] > 0
     assert abs(there.mean() - 0.8) < 5 * heavy.error
     assert sampled.isolated == []
     assert heavy.median[0] > 0
@@ -77,7 +77,7 @@ def test_without_jumps_weights_are_out_of_reach_and_nothing_is_left_out():
     assert sum(mode.walkers for mode in sampled.modes) == 24
     assert not any(mode.is_weighed for mode in sampled.modes)
     assert all(math.isnan(mode.error) for mode in sampled.modes)
-    assert sampled.isolated == [] and sampled.kept.shape[1] == 24
+    assert sampled.isolated == [] and sampled.draws.shape[1] == 24
 
 
 def test_walkers_in_a_negligible_mode_come_home():
@@ -102,7 +102,7 @@ def test_a_walker_that_cannot_come_home_is_named_with_what_is_left_out(monkeypat
     assert "left out: 1 of 24 walkers" in sampled.message
     assert sampled.converged, sampled.message
     assert sampled.isolated_mass < 1e-6
-    assert sampled.kept.shape[1] == 23 and sampled.kept_u[..., 0].max() < 0
+    assert sampled.draws.shape[1] == 23 and sampled.draws_u[..., 0].max() < 0
 
 
 def test_low_walkers_with_much_room_are_not_left_out():

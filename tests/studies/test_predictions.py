@@ -152,7 +152,7 @@ def test_blocks_have_the_likelihood_that_the_fit_has(problem, loss, correlation,
     )
     posterior = draws_near_the_truth(problem, draws=8)
     values = replay(problem, posterior, seed=0).blocks.values
-    plain = [plain_residuals(problem, row) for row in jnp.asarray(posterior.kept_u.reshape(-1, 2))]
+    plain = [plain_residuals(problem, row) for row in jnp.asarray(posterior.draws_u.reshape(-1, 2))]
     squares = [float(jnp.sum(apply_loss(each, loss, problem.tails) ** 2)) for each in plain]
     constants = values.sum(axis=1) + 0.5 * fraction * np.array(squares)
     np.testing.assert_allclose(constants, constants[0], rtol=1e-9)
@@ -169,7 +169,7 @@ def test_blocks_have_the_likelihood_that_the_fit_has(problem, loss, correlation,
 
 def test_sigmas_of_the_draws_count_in_the_likelihood(problem, replayed):
     posterior = draws_near_the_truth(problem)
-    count = posterior.kept_u.shape[0] * posterior.kept_u.shape[1]
+    count = posterior.draws_u.shape[0] * posterior.draws_u.shape[1]
     doubled = {kind: np.full(count, 2 * sigma) for kind, sigma in noise_of(problem).sigmas.items()}
     other = replay(problem, dataclasses.replace(posterior, sigmas=doubled), seed=0)
     assert other.blocks.values.sum() < replayed.blocks.values.sum()

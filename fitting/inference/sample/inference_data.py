@@ -86,7 +86,7 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
     )
     names = posterior.names
     groups = {
-        "posterior": {name: posterior.kept[..., i].T for i, name in enumerate(names)},
+        "posterior": {name: posterior.draws[..., i].T for i, name in enumerate(names)},
         "sample_stats": {"lp": log_probability.T},
         "prior": {name: drawn[None, :, i] for i, name in enumerate(names)},
     }

@@ -108,12 +108,12 @@ class Posterior(Shown):
     """Of some draws; None until they are run through the clips (`studies.sample.replay`)."""
 
     @property
-    def kept(self) -> Float[np.ndarray, "steps walkers free"]:
+    def draws(self) -> Float[np.ndarray, "steps walkers free"]:
         """Values after burn-in, without isolated walkers."""
         return np.delete(self.values[self.burn_in :], self.isolated, axis=1)
 
     @property
-    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
+    def draws_u(self) -> Float[np.ndarray, "steps walkers free"]:
         """`u` of the same draws."""
         return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
 
@@ -151,7 +151,7 @@ class Posterior(Shown):
         """One row per parameter, without burn-in and isolated walkers."""
         times = self.autocorrelation_time / self.thin_by
         return diagnostics.summarise(
-            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(self.kept_u)
+            self.names, self.draws, np.maximum(times, 1.0), diagnostics.split_r_hat(self.draws_u)
         )
 
 

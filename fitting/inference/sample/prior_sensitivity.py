@@ -47,10 +47,10 @@ def prior_sensitivity(posterior: Posterior, prior: Prior) -> dict[str, list[Rewe
     The spread in `u` of its own prior changes; a uniform prior becomes a logistic one of half or
     twice the scale, denser in the middle of the range or at its bounds.
     """
-    every = max(1, posterior.kept[..., 0].size // DRAWS)
+    every = max(1, posterior.draws[..., 0].size // DRAWS)
     u, values = (
         draws.reshape(-1, len(posterior.names))[::every]
-        for draws in (posterior.kept_u, posterior.kept)
+        for draws in (posterior.draws_u, posterior.draws)
     )
     ess = np.array([row["ess"] for row in posterior.summary])
     present = np.asarray(prior.residuals(jnp.asarray(u)))

@@ -376,7 +376,7 @@ def sample_replicate(
     ranks = rank(np.append(fitted["truth"], log_probability), draws, random)
     quantities = [*posterior.names, LOG_PROBABILITY]
     ends = 0.5 + np.multiply.outer(LEVELS, [-0.5, 0.5])
-    intervals = np.quantile(posterior.kept.reshape(-1, len(posterior.names)), ends, axis=0)
+    intervals = np.quantile(posterior.draws.reshape(-1, len(posterior.names)), ends, axis=0)
     return {
         "number": number,
         "ranks": dict(zip(quantities, ranks.tolist(), strict=True)),
@@ -409,7 +409,7 @@ def level_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
 def independent_draws(posterior: Posterior) -> Float[np.ndarray, "draws quantities"]:
     """Kept steps an autocorrelation time or more apart, all walkers: values, log-probability."""
     kept = np.delete(posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1)
-    both = np.concatenate([posterior.kept, kept[..., None]], axis=-1)
+    both = np.concatenate([posterior.draws, kept[..., None]], axis=-1)
     slowest = float(posterior.autocorrelation_time.max()) / posterior.thin_by
     apart = int(np.ceil(min(slowest, len(both))))  # infinite if nothing moves
     return both[::-apart].reshape(-1, both.shape[-1])

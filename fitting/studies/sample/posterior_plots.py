@@ -36,7 +36,7 @@ def corner(
     With a space, its prior stands over the posterior of each parameter.
     """
     size = len(posterior.names)
-    samples = posterior.kept.reshape(-1, size)
+    samples = posterior.draws.reshape(-1, size)
     samples = samples[:: max(1, len(samples) // SAMPLES)]
     marks = [[values.get(name) for name in posterior.names] for values in (fitted, truth or {})]
     ranges = [_range(samples[:, i], [values[i] for values in marks]) for i in range(size)]

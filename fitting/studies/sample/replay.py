@@ -51,8 +51,8 @@ class Replay:
 @in_float64
 def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> Replay:
     """Runs draws of a posterior through the clips."""
-    every = math.ceil(len(noise.thinned(posterior.kept_u)) / DRAWS)
-    u = noise.thinned(posterior.kept_u)[::every]
+    every = math.ceil(len(noise.thinned(posterior.draws_u)) / DRAWS)
+    u = noise.thinned(posterior.draws_u)[::every]
     sigmas = {kind: draws[::every] for kind, draws in posterior.sigmas.items()}
     clips = [_Clip(problem, index, seed) for index in range(len(problem.data))]
     with activity.announced(f"Playing {len(u)} draws of the posterior", len(u)) as playing:

@@ -104,7 +104,7 @@ def sample_around(
     if problem.unknown_sigmas is None:
         return posterior
     return dataclasses.replace(
-        posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed)
+        posterior, sigmas=draw_sigmas(problem, posterior.draws_u, experiment.seed)
     )
 
 
