@@ -75,7 +75,7 @@ def _read(table: Ablation, ik: jaxik.FootIK, where: str) -> Ablation:
 
 
 def read_capture(table: Table, clips: int, where: str) -> FreeTable:
-    """The entries of a [capture] table by name, for so many clips.
+    """The entries of a [capture] table by name.
 
     Raises:
         ValueError: a name or a clip is unknown, or a value is wrong.

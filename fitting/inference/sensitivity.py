@@ -2,10 +2,10 @@
 
 Each parameter is swept over its range while the others stay at the system's values, and again at a
 few draws from a wide prior, for at one point a rule may happen to be idle. The mean slope of every
-residual over such a sweep, which also sees what lies behind a threshold or a limit, stands in for
-its derivative, and a normal approximation then shows how far the clips would narrow down the
-parameters together. The one they narrow down least is fixed, and so on, until they narrow down all.
-It is a forecast: the fit shows what the clips do determine.
+residual over such a sweep, which also crosses thresholds and limits, replaces its derivative, and a
+normal approximation then shows how far the clips would narrow down the parameters together. The one
+they narrow down least is fixed, and so on, until they narrow down all. It is a forecast: the fit
+shows what the clips do determine.
 
 On flat ground a capture only shows that foot IK must not move the feet. Where a system moves
 them, the parameter whose change helps most is changed, then the next one, up to `MOST` of them,

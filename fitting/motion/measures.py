@@ -341,7 +341,7 @@ def place(
 def soles(solved: Clip, flat: Clip, terrain: Terrain, floor: float = 0.0) -> Soles:
     """The soles of a motion over a terrain; see `place`.
 
-    The ground is looked for from `step_height` above the sole or the ground of the path, whichever
+    The ground is sought from `step_height` above the sole or the ground of the path, whichever
     is higher, so that a character inside a hill is in the ground, and a roof is not ground.
     """
     points = sole_points(solved)

@@ -49,7 +49,7 @@ class CapturedSystem(jaxik.FootIK):
 
 
 def with_capture(ik: jaxik.FootIK, clips: int, names: Sequence[str]) -> CapturedSystem:
-    """A system with a capture of so many clips without errors; the names are the fitted fields."""
+    """A system with a capture of several clips without errors; the names are the fitted fields."""
     stages = {stage.name: getattr(ik, stage.name) for stage in dataclasses.fields(ik)}
     moves_ground = any(name in GROUND for name in names)
     return CapturedSystem(**stages, capture=Capture().for_clips(clips), moves_ground=moves_ground)
@@ -132,7 +132,7 @@ def centre_of(frames: jaxik.Frame) -> Float[Array, "3"]:
 
 
 def _with_offsets(capture: Capture, rig: jaxik.Rig, ankle: Transform) -> Transform:
-    """The ankle where its capture is, turned as far as that of the ball turns the foot."""
+    """The ankle where its capture is, turned by the angle by which the ball's turns the foot."""
     ankle_from_foot = Transform(jnp.zeros_like(rig.ankle_from_foot[..., 1:]), rig.ankle_from_foot)
     offset = _in_foot(rig, capture.ankle_outward, capture.ankle_up, capture.ankle_forward)
     drop = rig.ball_height - rig.ankle_height

@@ -335,7 +335,7 @@ class Stack(NamedTuple):
         return chosen(self.scenes, self.stacked, number)
 
     def part(self, first: int, count: int) -> Scene:
-        """So many clips from one of them on; the last clip is repeated where there are fewer."""
+        """Clips from the first on; the last clip is repeated where there are too few."""
         numbers = np.minimum(np.arange(first, first + count), len(self.members) - 1)
         return chosen(self.scenes, self.stacked, numbers)
 
@@ -365,7 +365,7 @@ def rounded_up(frames: int) -> int:
 
 
 def padded(scene: Scene, frames: int) -> Scene:
-    """A clip with its last frame repeated until it has so many; repetitions are not observed.
+    """A clip with its last frame repeated up to a length; repetitions are not observed.
 
     Raises:
         ValueError: it has more frames than that.

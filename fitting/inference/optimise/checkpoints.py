@@ -1,4 +1,4 @@
-"""The finished stages of searches and profiles, in a file from which a killed process goes on.
+"""The finished stages of searches and profiles, in a file from which a killed process continues.
 
 A stage follows from the state before it and from nothing else that changes. So a search that is
 begun again takes the ends of its first stages from the file, in their order, and computes the

@@ -61,7 +61,7 @@ def find_best_fit(
 
     KeyboardInterrupt (Ctrl-C) ends the search at the best point so far, if there is one. The
     solution's `converged` and `message` say how far to trust it. Where `Checkpoints` are entered,
-    the search goes on after the stages that they have of it.
+    the search continues after the stages that they have of it.
 
     Args:
         problem: what to fit.

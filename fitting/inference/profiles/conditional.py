@@ -1,11 +1,11 @@
 """The lowest cost with one parameter held at a value, the others following.
 
 The cost has cliffs wherever a hard decision flips, along smooth parameters as well: a full
-Gauss-Newton step often falls off one. So many candidates compete for each value. In each of them a
-random subset of the parameters that have slopes takes a Gauss-Newton step with the Jacobian at the
-solution, some with a random move besides, since where a cliff is depends on all parameters; the
-best candidate is the base of the next ones. Far from the solution, where its Jacobian does not
-hold, a descent by Levenberg–Marquardt follows.
+Gauss-Newton step often falls off one. Therefore many candidates compete for each value. In each of
+them a random subset of the parameters that have slopes makes a Gauss-Newton step with the Jacobian
+at the solution, some with an additional random move, since the places of cliffs depend on all
+parameters; the best candidate is the base of the next ones. Far from the solution, where its
+Jacobian does not hold, a descent by Levenberg–Marquardt follows.
 
 A threshold has no derivative, but where it shifts a weight that fades in or out, the motion changes
 in proportion all the same, and two such thresholds may form a ridge along which both must move. Its

@@ -45,7 +45,7 @@ SPANS = (1.0, 0.2, 0.04)  # of moves of thresholds, fractions of the range
 CROSSINGS = 8  # rounds in which cliffs are crossed, at most
 BEYOND = (0.0, 0.3, 1.0, 3.0)  # how far behind a cliff points are tried, in widths of the minimum
 CLIFF = 1.5  # times the rise of a parabola: what lies behind the end of a minimum may be a cliff
-NEARBY = 0.25  # widths of the minimum within which it is looked for
+NEARBY = 0.25  # widths of the minimum within which a cliff is sought
 NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpolated
 NARROW = 0.05  # fraction of a minimum's width that its ends are found to
 
@@ -218,7 +218,7 @@ def _stored_points(points: Points) -> StoredPoints:
 
 
 def _points(stored: StoredPoints, size: int) -> Points:
-    """Points of so many parameters."""
+    """Points of a space of this size."""
 
     def array(rows: Sequence[Sequence[float]]) -> np.ndarray:
         return np.array(rows, np.float64).reshape(len(stored["cost"]), size)
@@ -342,7 +342,7 @@ def share(profiling: Profiling) -> None:
 
 
 def cross(profiling: Profiling) -> None:
-    """Goes on beyond cliffs, unless there was nothing to cross in the round before."""
+    """Continues beyond cliffs, unless there was nothing to cross in the round before."""
     if not profiling.crossed and cross_cliffs(profiling):
         refine(profiling)
     else:
@@ -350,7 +350,7 @@ def cross(profiling: Profiling) -> None:
 
 
 def cross_cliffs(profiling: Profiling) -> bool:
-    """Tries to go on beyond cliffs that end a minimum; whether any was crossed.
+    """Tries to continue beyond cliffs that end a minimum; whether any was crossed.
 
     Behind a cliff another decision holds, so other parameters must move together with this one:
     they are drawn anew within their own intervals and a little beyond.

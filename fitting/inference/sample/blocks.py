@@ -158,7 +158,7 @@ class SamplerSettings(Table):
         20_000, "Steps of the sampler at most, over all runs of a chain.", "steps", 1, 10**9
     )
     min_steps: int = key(0, "Steps before which sampling does not stop.", "steps", 0, 10**9)
-    thin_by: int = key(1, "One step in so many is stored.", "steps", 1, 10**6)
+    thin_by: int = key(1, "One step of this many is stored.", "steps", 1, 10**6)
     check_every: int = key(
         100, "Steps between reports, and at least between checks of convergence.", "", 1, 10**6
     )

@@ -17,7 +17,7 @@ from .chain import autocorrelation_time
 POINTS = 1000  # draws among which gaps are sought, at most
 GAP = 1.6  # spreads, and times the usual gap on either side, that separate modes
 USUAL = 0.9  # quantile of the gaps between neighbours that is usual
-MAX_MODES = 8  # where there seem to be more, the walkers have not met yet
+MAX_MODES = 8  # if more are found, the walkers have not mixed yet
 SMALLEST = 0.01  # fraction of the draws of a mode
 DEGREES = 5.0  # of freedom of the t distribution: tails wide enough for modes that are not normal
 MIN_EXCHANGES = 20  # of a mode with the others, below which its weight is unknown

@@ -149,7 +149,7 @@ def _start(
     widths: Balls,
 ) -> LastStep:
     """Walkers in their balls, each drawn until its log-probability is finite."""
-    random = np.random.RandomState(identity.seed)  # emcee goes on with this generator's state
+    random = np.random.RandomState(identity.seed)  # emcee continues with this generator's state
     u = np.empty(centres.shape)
     log_probability = np.full(identity.walkers, -np.inf)
     for _ in range(DRAWS):
