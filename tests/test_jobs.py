@@ -66,7 +66,7 @@ FIT_WORK = [
     ("Playing the clips with the fitted system", PLAY),
     ("Drawing the curves of the parameters", (fit_report, "_draw_search")),
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
-    ("Measuring where limits are in effect", (fit_report.playback, "measure"), PLAY),
+    ("Measuring where limits are in effect", (fit_report.playback, "measure_activity"), PLAY),
     ("Finding what determines 2 parameters", (identifiability_report, "find_evidence"), PLAY),
     ("Writing the page", (document.Document, "write")),
     ("Finishing the pictures",),

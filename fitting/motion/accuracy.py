@@ -221,7 +221,7 @@ class Remainder:
         return 1.0 - self.rms / self.correction if self.correction > NEGLIGIBLE else None
 
 
-def measure(scene: Scene, result: jaxik.Result) -> Difference:
+def measure_difference(scene: Scene, result: jaxik.Result) -> Difference:
     """How far a system's result is from the scene's reference in each frame."""
     present = np.asarray(scene.rig.present)
     dt = np.asarray(scene.frames.dt)

@@ -251,15 +251,15 @@ class ClipActivity:
     """Fraction in which a limit changes the pose, by parameter name."""
 
 
-def measure(
+def measure_activity(
     ik: jaxik.FootIK, scenes: Sequence[Scene], results: Sequence[jaxik.Result]
 ) -> list[ClipActivity]:
     """The activity of a system on the clip of each scene, from its results on them."""
     limits = active_limits(ik, scenes, results)
-    return [_measured(*clip) for clip in zip(scenes, results, limits, strict=True)]
+    return [_activity(*clip) for clip in zip(scenes, results, limits, strict=True)]
 
 
-def _measured(scene: Scene, result: jaxik.Result, limits: dict[str, float]) -> ClipActivity:
+def _activity(scene: Scene, result: jaxik.Result, limits: dict[str, float]) -> ClipActivity:
     trace, present = stage_outputs(result), np.asarray(scene.rig.present)
     locked = np.asarray(trace.advanced.hold.locked)[:, present] > 0.5
     switches = np.diff(locked.astype(int), axis=0)

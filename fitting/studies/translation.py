@@ -319,7 +319,7 @@ def save_source(run: Path, translation: Translation) -> None:
 def differences(fitted: Fit) -> list[Difference]:
     """What remains of the source's correction, for each clip."""
     return [
-        accuracy.measure(scene, result)
+        accuracy.measure_difference(scene, result)
         for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
     ]
 

@@ -235,7 +235,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
     nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
     for nudge in (down, up):
         assert f"| {100 * nudge.flipped:.2f} % | {nudge.rise:+.1f} |" in nudged
-    (activity,) = playback.measure(fitted.ik, fitted.problem.data, fitted.results)
+    (activity,) = playback.measure_activity(fitted.ik, fitted.problem.data, fitted.results)
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
 
@@ -301,7 +301,7 @@ def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(f
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
-    (activity,) = playback.measure(fitted.ik, fitted.problem.data, fitted.results)
+    (activity,) = playback.measure_activity(fitted.ik, fitted.problem.data, fitted.results)
     (result,) = fitted.results
     locked = np.asarray(playback.stage_outputs(result).advanced.state.lock.locked)
     assert activity.frames == 30 and activity.seconds == pytest.approx(2.0)

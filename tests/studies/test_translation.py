@@ -80,7 +80,7 @@ def run(source, clip, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         small_studies.quick_fits(patch)
         patch.setattr(Figure, "savefig", save_pixel)
-        patch.setattr(fit_report.playback, "measure", lambda *_: [ACTIVITY])
+        patch.setattr(fit_report.playback, "measure_activity", lambda *_: [ACTIVITY])
         assert main.main(command(clip, folder, source)) == 0
     return folder
 
@@ -177,7 +177,7 @@ def test_a_character_stands_below_2_centimetres_a_second(run):
     scene = replace(scene, frames=replace(scene.frames, velocity_ws=jnp.asarray(velocity)))
     unmoved = Mock(spec=jaxik.Result, body=Transform.identity(), pose=scene.frames.pose)
     slow = np.abs(velocity[:, 0]) < 0.02
-    np.testing.assert_array_equal(accuracy.measure(scene, unmoved).standing, slow)
+    np.testing.assert_array_equal(accuracy.measure_difference(scene, unmoved).standing, slow)
 
 
 def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():

@@ -127,5 +127,5 @@ def _play(problem: Problem[jaxik.FootIK]) -> tuple[jaxik.Result, ...]:
     results = playback.run_all(system, scenes)
     for scene, result in zip(scenes, results, strict=True):
         playback.play(scene, result)
-    playback.measure(system, scenes, results)
+    playback.measure_activity(system, scenes, results)
     return results

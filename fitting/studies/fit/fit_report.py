@@ -99,7 +99,7 @@ def write_fit(
         with activity.announced("Measuring where limits are in effect"):
             measured = Measured(
                 before,
-                playback.measure(fitted.ik, fitted.scenes, fitted.results),
+                playback.measure_activity(fitted.ik, fitted.scenes, fitted.results),
                 playback.nudge_thresholds(fitted.problem, fitted.solution.u),
             )
         details = [*details, Section("Pictures", [*plots, *curves], on_page=False)]
