@@ -85,7 +85,8 @@ def find_worst_window(playback: Playback) -> WorstWindow:
     sizes = _sizes(playback, kinds[0])[inside]
     offset_frame, column = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
     frame, leg = start + int(offset_frame), int(column) if kinds[0] in PER_LEG else None
-    seen_inside = seen & _within(inside, len(seen))
+    seen_inside = np.zeros_like(seen)
+    seen_inside[inside] = seen[inside]
     pelvis = playback.height(playback.after.pelvis) - playback.height(playback.captured.pelvis)
     return WorstWindow(
         start=start,
@@ -156,12 +157,6 @@ def window_sums(series: Float[np.ndarray, " frames"], length: int) -> Float[np.n
     """Sums over all windows of `length` frames, by their first frame."""
     sums = np.concatenate([[0.0], np.cumsum(series)])
     return sums[length:] - sums[:-length]
-
-
-def _within(inside: slice, frames: int) -> Bool[np.ndarray, " frames"]:
-    mask = np.zeros(frames, bool)
-    mask[inside] = True
-    return mask
 
 
 def _offset(

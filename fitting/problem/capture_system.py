@@ -41,12 +41,6 @@ class CapturedSystem(jaxik.FootIK):
     moves_ground: bool = eqx.field(static=True, default=False)
     """Whether errors of the ground are fitted: else rays are as without a capture."""
 
-    @property
-    def alone(self) -> jaxik.FootIK:
-        """The system itself."""
-        stages = dataclasses.fields(jaxik.FootIK)
-        return jaxik.FootIK(**{stage.name: getattr(self, stage.name) for stage in stages})
-
 
 def with_capture(ik: jaxik.FootIK, clips: int, names: Sequence[str]) -> CapturedSystem:
     """A system with a capture of several clips without errors; the names are the fitted fields."""
@@ -62,14 +56,17 @@ def is_of_capture(name: str) -> bool:
 
 def alone(ik: jaxik.FootIK) -> jaxik.FootIK:
     """The system itself, if there is a capture beside it."""
-    return ik.alone if isinstance(ik, CapturedSystem) else ik
+    if not isinstance(ik, CapturedSystem):
+        return ik
+    stages = dataclasses.fields(jaxik.FootIK)
+    return jaxik.FootIK(**{stage.name: getattr(ik, stage.name) for stage in stages})
 
 
 def parted(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> tuple[jaxik.FootIK, tuple[Scene, ...]]:
     """The system itself, and the clips with the capture beside it."""
     if not isinstance(ik, CapturedSystem):
         return ik, scenes
-    return ik.alone, tuple(
+    return alone(ik), tuple(
         _with_capture(scene, ik.capture.of_clip(number), moves_ground=ik.moves_ground)
         for number, scene in enumerate(scenes)
     )
