@@ -17,14 +17,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from fitting.runtime import activity, cache_folder, xla
+from fitting.runtime import activity, cache_folder, machine, xla
 from fitting.runtime.threads import on_all_cores, usable_cores
 
 from .roofline import Work, lower_bound, work_of_program
@@ -32,10 +31,6 @@ from .workloads import Sizes
 
 SAMPLE = 0.2  # s, shortest sample: a faster call is repeated within it
 Call: TypeAlias = Callable[[], object]  # returns once its result is there
-
-STATUS = Path("/proc/self/status")
-MEMORY = Path("/proc/meminfo")
-CPU = Path("/proc/cpuinfo")
 
 # Factors of a unit. A figure in one of seconds is the time of an item, in another their rate.
 SECONDS = {"s": 1.0, "ms": 1e3, "µs": 1e6, "ns": 1e9}
@@ -294,11 +289,11 @@ def hardware() -> dict[str, Any]:
     """The hardware and software of this process, as the JSON report holds them."""
     device = jax.devices()[0]
     return {
-        "cpu": _system_entry(CPU, "model name") or platform.processor() or platform.machine(),
+        "cpu": machine.processor(),
         "cores": os.cpu_count(),
-        "vector_bits": xla.vector_bits(),
+        "vector_bits": machine.vector_bits(),
         "threads": usable_cores(),
-        "memory_gb": _memory_gb(),
+        "memory_gb": machine.memory_gb(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
         "jaxlib": xla.jaxlib_version(),
@@ -313,44 +308,18 @@ def time_in_width() -> float:
     Vectors of twice the width take 0.7 of the time, the square root of a half: what goes through
     caches and calls does not get faster.
     """
-    return math.sqrt(256 / (xla.vector_bits() or 256))
-
-
-def _memory_gb() -> float | None:
-    """All memory of the machine; None where the system does not report it."""
-    entry = _system_entry(MEMORY, "MemTotal")
-    return float(entry.split()[0]) / 1e6 if entry else None
-
-
-def _system_entry(path: Path, key: str) -> str:
-    """The first entry of a key in a system file; empty where there is no such file or key."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
-
-
-def load_average() -> float:
-    """Load average over the last minute; NaN where the system does not report it."""
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-
-
-def reset_peak_memory() -> None:
-    """Restarts the record of peak resident memory, where the system allows it."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        pass  # then the peak counts from the start of the process
+    return math.sqrt(256 / (machine.vector_bits() or 256))
 
 
 def peak_memory_mb() -> float:
     """Peak memory, MB; NaN where the system does not report it.
 
     That of the device since the process started, where the device reports it; otherwise resident
-    memory since `reset_peak_memory`.
+    memory since `machine.reset_peak`.
     """
     if statistics := jax.devices()[0].memory_stats():
         return statistics.get("peak_bytes_in_use", float("nan")) / 1e6
-    peak = _system_entry(STATUS, "VmHWM")
-    return float(peak.split()[0]) / 1e3 if peak else float("nan")
+    return machine.peak_mb() or float("nan")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -395,7 +364,7 @@ def run_benchmarks(
             announce(f"[{number + 1}/{len(benchmarks)}] {name}: {benchmark.title}")
             measurement = Measurement(
                 name, benchmark.title, sizes.repeats, benchmark.floats, ceilings,
-                load=load_average(),
+                load=machine.load_average(),
             )  # fmt: skip
             report.measurements.append(measurement)
             report.interrupted = _interrupted(measurement, benchmark, sizes)

@@ -11,14 +11,13 @@ from matplotlib.figure import Figure as PlotFigure
 
 from fitting.report import formatting, style
 from fitting.report.style import STAGES, panels, styled
-from fitting.runtime import files, xla
+from fitting.runtime import files, machine, xla
 
 from .measurement import (
     Measurement,
     Report,
     Series,
     hardware,
-    load_average,
     medians,
     time_in_width,
 )
@@ -43,7 +42,7 @@ def to_json(report: Report) -> str:
 
 def _loads(report: Report) -> list[float]:
     """Load averages at the start of each benchmark, and now."""
-    return [measurement.load for measurement in report.measurements] + [load_average()]
+    return [measurement.load for measurement in report.measurements] + [machine.load_average()]
 
 
 def _numbers(measurement: Measurement) -> dict[str, Any]:
@@ -66,14 +65,14 @@ def _finite(value: PyTree) -> PyTree:
 
 def text(report: Report) -> str:
     """The machine, a table with a line for each figure, compile times and notes."""
-    machine = hardware()
+    facts = hardware()
     loads = _loads(report)
-    memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
-    vectors = f"vectors of {machine['vector_bits']} bits, " if machine["vector_bits"] else ""
+    memory = f"{facts['memory_gb']:.0f} GB, " if facts["memory_gb"] else ""
+    vectors = f"vectors of {facts['vector_bits']} bits, " if facts["vector_bits"] else ""
     lines = [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, "
+        f"{facts['cpu']}, {facts['cores']} cores, {facts['threads']} threads used, "
         f"{vectors}{memory}"
-        f"{machine['device']}; JAX {machine['jax']}, Python {machine['python']}; "
+        f"{facts['device']}; JAX {facts['jax']}, Python {facts['python']}; "
         f"load average {min(loads):.1f} to {max(loads):.1f}",
         f"XLA flags: {xla.describe_flags()}",
         "Medians of several runs. CPU: by CPU time, divided by the number of threads that work. "
@@ -156,8 +155,8 @@ def write(report: Report, numbers: Path | None, curves: Path | None) -> list[Pat
         written.append(numbers)
     series = [each for measured in report.measurements for each in measured.series if each.sizes]
     if curves is not None and series:
-        machine = hardware()
-        title = f"{machine['cpu']}, {machine['threads']} threads"
+        facts = hardware()
+        title = f"{facts['cpu']}, {facts['threads']} threads"
         style.save(curves, draw_curves(series, title))
         written.append(curves)
     return written

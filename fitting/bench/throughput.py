@@ -28,8 +28,8 @@ from fitting.clips import edit
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.experiment.problems import ClipData
 from fitting.experiment.systems import Preset
-from fitting.runtime import cache_folder, xla
-from fitting.runtime.cluster import Stopwatch, peak_mb
+from fitting.runtime import cache_folder, machine, xla
+from fitting.runtime.cluster import Stopwatch
 from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.studies.animations import Animation
 from fitting.viewer import Solver, Subject, Take, knobs
@@ -45,7 +45,6 @@ from .measurement import (
     Series,
     call_in_process,
     peak_memory_mb,
-    reset_peak_memory,
     time_in_width,
 )
 from .workloads import Crowd, Member, Sizes
@@ -201,7 +200,7 @@ def _second_time(call: Callable[[], object]) -> dict[str, float]:
     return {
         "seconds": effort["seconds"],
         "cpu_seconds": effort["cpu_seconds"],
-        "peak_mb": peak_mb() or float("nan"),
+        "peak_mb": effort["peak_mb"] or float("nan"),
     }
 
 
@@ -278,7 +277,7 @@ def crowd(measurement: Measurement, sizes: Sizes) -> None:
         name: in_chunks(measurement, name, forward, people, ground, sizes.chunk)
         for name, (ground, _) in grounds.items()
     }
-    reset_peak_memory()
+    machine.reset_peak()
     measurement.time_in_turns(calls, sizes.crowd_repeats)
     peak = peak_memory_mb()
     for name, (_, target) in grounds.items():
@@ -297,7 +296,7 @@ def gradient(measurement: Measurement, sizes: Sizes) -> None:
         name: in_chunks(measurement, name, function, people, flat, sizes.chunk)
         for name, function in (("forward", forward), ("reverse", reverse))
     }
-    reset_peak_memory()
+    machine.reset_peak()
     measurement.time_in_turns(calls, sizes.crowd_repeats)
     peak, work = peak_memory_mb(), measurement.work
     operations = work["reverse"].operations / work["forward"].operations

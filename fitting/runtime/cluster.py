@@ -16,7 +16,6 @@ import logging
 import os
 import platform
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import jax
 
-from . import cache_folder, xla
+from . import cache_folder, machine, xla
 from .claimed_folder import InUseError, claimed
 from .precision import in_float64
 
@@ -40,17 +39,12 @@ DASHBOARD = "127.0.0.1:0"  # any free port, for this machine only
 # Of memory, after which a worker drops its compiled programs: Linux ends a process that asks for
 # more than 65,530, and each program takes some. They are read again from the cache.
 MAX_MAPPINGS = 20_000
-MAPPINGS = Path("/proc/self/maps")
 # Dask would look at every stack a hundred times a second: 7 % of a fit's CPU time.
 UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 # With this variable, Dask has its workers give freed memory back at once. Each larger array is then
 # mapped, filled with zeros and unmapped again, which takes a fifth of a short fit's CPU time.
 TRIMMED = "MALLOC_TRIM_THRESHOLD_"
 Argument = TypeVar("Argument")
-
-# Of Linux, in kB. What `getrusage` says there begins with the peak of the process that started this
-# one, so that a small process of a large one would look large.
-STATUS, HIGHEST = Path("/proc/self/status"), "VmHWM"
 
 PATIENCE = 0.2  # s between looks at a lock
 
@@ -220,7 +214,7 @@ def _loaded(function: bytes) -> Callable[[Any], Any]:
 
 def drop_programs_of_too_many() -> None:
     """Forgets this process's compiled programs where they take many mappings of memory."""
-    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MAX_MAPPINGS:
+    if machine.mappings() > MAX_MAPPINGS:
         jax.clear_caches()
 
 
@@ -262,25 +256,10 @@ class Stopwatch:
             "seconds": time.monotonic() - began - self._waited,
             "waited": self._waited,
             "cpu_seconds": time.process_time() - cpu_began,
-            "peak_mb": peak_mb(),
+            "peak_mb": machine.peak_mb(),
             "host": platform.node(),
             "process": os.getpid(),
         }
-
-
-def peak_mb() -> float | None:
-    """Resident memory of this process at its highest; None where the system does not say."""
-    if STATUS.exists():
-        lines = STATUS.read_text(encoding="utf-8").splitlines()
-        values = dict(line.split(":", 1) for line in lines if ":" in line)
-        if HIGHEST in values:
-            return float(values[HIGHEST].split()[0]) * 1024 / 1e6
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
 @contextmanager

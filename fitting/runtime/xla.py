@@ -4,13 +4,9 @@ import ctypes
 import os
 import warnings
 from importlib import metadata
-from pathlib import Path
 
 VARIABLE = "XLA_FLAGS"
 ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
-
-CPU = Path("/proc/cpuinfo")  # on Linux
-WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256, "sse2": 128, "asimd": 128}  # bits
 
 # What each flag gains was measured with JAX 0.10.2; in brackets, by CPU time with 0.12.0.1.
 
@@ -96,14 +92,6 @@ def ignore_debugging() -> None:
 def jaxlib_version() -> str:
     """The installed version of the library that holds XLA."""
     return metadata.version("jaxlib")
-
-
-def vector_bits() -> int | None:
-    """Width of this core's vectors; None where the system does not tell its features."""
-    text = CPU.read_text(encoding="utf-8") if CPU.is_file() else ""
-    rows = (line.partition(":") for line in text.splitlines())
-    known = next((row[2].split() for row in rows if row[0].strip() in ("flags", "Features")), [])
-    return next((bits for feature, bits in WIDTHS.items() if feature in known), None)
 
 
 def combine_flags(flags: tuple[str, ...], of_user: str | None) -> str:

@@ -15,6 +15,7 @@ import pytest
 from fitting.cli import examination, main, self_test, status
 from fitting.cli.examination import Finding, from_json
 from fitting.experiment import problems
+from fitting.runtime import machine
 from support import quick
 from support.experiments import ROOT
 
@@ -133,7 +134,7 @@ def test_a_missing_and_an_old_package_are_problems_and_an_extra_only_if_it_is_br
 def test_little_memory_and_an_examination_that_fails_itself_are_problems(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(examination, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(machine, "PROC", tmp_path)
     (tmp_path / "meminfo").write_text("MemTotal: 4000000 kB\nMemAvailable: 500000 kB\n")
     (*_, memory) = examination.examine_machine()
     assert memory.fact == "4.0 GB, 0.5 GB of them free" and "only 0.5 GB" in memory.problem

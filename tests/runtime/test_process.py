@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from fitting.cli import jax_start
-from fitting.runtime import cluster, threads, xla
+from fitting.runtime import cluster, machine, threads, xla
 from fitting.runtime.precision import for_other_thread, in_float64, with_floats
 from support.experiments import ROOT
 
@@ -346,7 +346,7 @@ def test_a_cluster_that_cannot_be_is_refused_and_none_is_this_process(monkeypatc
 def test_the_peak_of_a_process_does_not_begin_with_that_of_its_parent():
     # Of resident memory: what the parent has touched counts.
     taken = b"1" * 600_000_000
-    words = "from fitting.runtime.cluster import peak_mb; print(peak_mb())"
-    own = cluster.peak_mb()
+    words = "from fitting.runtime.machine import peak_mb; print(peak_mb())"
+    own = machine.peak_mb()
     assert own is not None and own > len(taken) / 1e6
     assert 1.0 < float(printed(words, **os.environ)) < 300.0
