@@ -32,8 +32,8 @@ from fitting.runtime import cache_folder, machine, xla
 from fitting.runtime.cluster import Stopwatch
 from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.studies.animations import Animation
-from fitting.viewer import Solver, Subject, Take, knobs
-from fitting.viewer.subject import DEFAULT, cost_of_problem
+from fitting.viewer import Session, SessionClip, Solver, sliders
+from fitting.viewer.session import DEFAULT, cost_of_problem
 from jaxik.world import terrain
 from jaxik.world.terrain import Terrain, plane
 
@@ -398,35 +398,37 @@ def run(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Terrain, motion: jaxik.Frame) 
     return result.corrections, result.body, result.reached
 
 
-def subject(frame_count: int) -> Subject:
+def session(frame_count: int) -> Session:
     """A recording at 30 Hz of so many frames at 60 Hz, with the cost of twenty parameters."""
     reference, base, mesh = workloads.recording(frame_count)
     reference, base = (edit.resample(clip, RATE) for clip in (reference, base))
     data = ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces))
     problem = workloads.problem_from_clips([data])
     frames = problem.data[0].frames
-    take = Take("walk", Animation(base, data.terrain, given_frames=frames, captured=reference))
+    animation = Animation(base, data.terrain, given_frames=frames, captured=reference)
     cost = functools.partial(cost_of_problem, problem)
     starts = {DEFAULT: problem.space.system}
-    return Subject("walk", (take,), starts, Preset("record", faithful=True), cost=cost)
+    clips, preset = (SessionClip("walk", animation),), Preset("record", faithful=True)
+    return Session("walk", clips, starts, preset, cost=cost)
 
 
 def drag(measurement: Measurement, sizes: Sizes) -> None:
     """Solves a clip of 10 s again for other values: motion, feet, overlays and cost."""
-    walk = subject(sizes.frames)
+    walk = session(sizes.frames)
     solver, ik = Solver(walk), walk.starts[DEFAULT]
     measurement.progress("view: compiling solve")
     start = time.perf_counter()
     solver.solve(ik)
     measurement.compile_s["solve"] = time.perf_counter() - start
     random = np.random.default_rng(0)
-    numbers = [knob for knob in knobs(ik, walk.rig) if not knob.is_switch]
+    numbers = [slider for slider in sliders(ik, walk.rig) if not slider.is_switch]
     chosen = [numbers[i] for i in random.integers(len(numbers), size=DRAGS)]
-    drags = itertools.cycle([(knob, float(random.uniform(knob.low, knob.high))) for knob in chosen])
+    values = [float(random.uniform(slider.low, slider.high)) for slider in chosen]
+    drags = itertools.cycle(zip(chosen, values, strict=True))
 
     def solve() -> None:
-        knob, value = next(drags)
-        solver.solve(knob.write(ik, value))
+        slider, value = next(drags)
+        solver.solve(slider.write(ik, value))
 
     measurement.time_in_turns({"drag": solve})
     seconds = solver.animation.clip.seconds

@@ -175,8 +175,8 @@ def view(options: argparse.Namespace) -> int:
     animation, preset, given = _animation(options), Preset(options.preset), None
     if options.parameters is not None:
         given, preset = load_system(options.parameters, animation.flat_clip.rig)
-    subject = viewer.subject_of_animation(animation, preset, given)
-    jobs.view(subject, folder, address)
+    session = viewer.session_of_animation(animation, preset, given)
+    jobs.view(session, folder, address)
     return 0
 
 

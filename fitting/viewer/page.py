@@ -1,4 +1,4 @@
-"""A subject on a page: moves of sliders become solutions, and these become pictures."""
+"""A session on a page: moves of sliders become solutions, and these become pictures."""
 
 import contextlib
 import functools
@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 
@@ -27,8 +27,8 @@ from fitting.runtime.precision import in_float64
 from jaxik.world import body
 
 from . import tuning
+from .session import Lines, Session, Slider, sliders
 from .solving import NAMES, SKELETONS, Drawn, Solved, Solver
-from .subject import Knob, Lines, Subject, knobs
 from .tuning import Tuning
 
 GROUND = (150, 138, 116)
@@ -45,12 +45,12 @@ SKELETON_LABELS = {
     "captured": "Captured (orange)",
 }
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2")
-Moved = Callable[[Knob, float | bool], object]
+Moved = Callable[[Slider, float | bool], object]
 
 RATE = 30.0  # Hz, at which frames are drawn at most
 
 MARKS = re.compile(r"([\\`*_{}\[\]<>()#+.!|~&-])")
-SHOWN = "penetration", "contact", "slide"  # of each motion
+MEASURES = "penetration", "contact", "slide"  # of each motion
 
 ANY_PORT = 0
 OWN = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
@@ -58,18 +58,18 @@ OWN = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 
 
 class Viewer:
-    """The page of a subject, until it is closed.
+    """The page of a session, until it is closed.
 
     Args:
         server: of an empty page.
-        subject: what is viewed.
+        session: what is viewed.
         folder: where Save writes.
     """
 
-    def __init__(self, server: viser.ViserServer, subject: Subject, folder: Path):
-        self.server, self.subject, self.folder = server, subject, folder
-        self.tuning = Tuning(subject.starts)
-        self.solver = Solver(subject)
+    def __init__(self, server: viser.ViserServer, session: Session, folder: Path):
+        self.server, self.session, self.folder = server, session, folder
+        self.tuning = Tuning(session.starts)
+        self.solver = Solver(session)
         self.solved: Solved | None = None
         self._compiled: Solver | None = None  # whose programs are
         self.costs: dict[str, float] = {}
@@ -85,35 +85,35 @@ class Viewer:
 
     def _build_panel(self) -> None:
         gui, clip = self.server.gui, self.solver.animation.placed_clip
-        gui.add_markdown(f"**{literal(self.subject.title)}**")
-        if len(self.subject.takes) > 1:
-            names = tuple(take.name for take in self.subject.takes)
+        gui.add_markdown(f"**{literal(self.session.title)}**")
+        if len(self.session.clips) > 1:
+            names = tuple(clip.name for clip in self.session.clips)
             choice = gui.add_dropdown("Clip", names)
             choice.on_update(lambda _: self._choose(names.index(choice.value)))
-        self._way_back = WayBackPanel(gui, self.tuning.starts)
+        self._history = HistoryPanel(gui, self.tuning.starts)
         self._time = TimePanel(gui, clip.frame_count)
-        self._shown = ShownPanel(gui, any(take.animation.captured for take in self.subject.takes))
-        every = knobs(self.tuning.ik, self.subject.rig, self.subject.free)
-        self._knobs = KnobPanel(gui, every, self.tuning.ik, self._move)
+        self._layers = LayerPanel(gui, any(clip.animation.captured for clip in self.session.clips))
+        every = sliders(self.tuning.ik, self.session.rig, self.session.free)
+        self._sliders = SliderPanel(gui, every, self.tuning.ik, self._move)
 
     def _connect(self) -> None:
-        times, way_back = self._time, self._way_back
+        times, history = self._time, self._history
         times.play.on_update(lambda _: self._player.play(times.play.value))
         times.frame.on_update(lambda event: event.client and self._seek(times.frame.value))
         times.speed.on_update(lambda _: setattr(self._player, "speed", float(times.speed.value)))
         times.follow.on_update(lambda _: setattr(self._figure, "follows", times.follow.value))
-        for box in self._shown.boxes.values():
-            box.on_update(lambda _: self._show_chosen())
-        way_back.step.on_click(lambda _: self._step(way_back.step.value))
-        way_back.reset.on_click(lambda _: self.reset(way_back.reset.value))
-        way_back.save.on_click(lambda _: self.save())
+        for box in self._layers.boxes.values():
+            box.on_update(lambda _: self._update_layers())
+        history.step.on_click(lambda _: self._step(history.step.value))
+        history.reset.on_click(lambda _: self.reset(history.reset.value))
+        history.save.on_click(lambda _: self.save())
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Waits until what was moved is solved and shown; False if that takes longer."""
+        """Waits until what was moved is solved and drawn; False if that takes longer."""
         return self._latest.wait(seconds)
 
     def reset(self, name: str) -> None:
-        """Goes back to one of the subject's systems."""
+        """Goes back to one of the session's systems."""
         with self._lock:
             self.tuning.reset(name)
         self._moved()
@@ -122,34 +122,35 @@ class Viewer:
         """Begins anew with another system, as a fit that goes on finds better ones."""
         with self._lock:
             self.tuning.restart(name, ik)
-        self._way_back.reset.options = tuple(self.tuning.starts)
-        self._way_back.said.content = literal(note)
+        self._history.reset.options = tuple(self.tuning.starts)
+        self._history.message.content = literal(note)
         self._moved()
 
     def save(self) -> None:
-        """Writes the system as it is, and says what was written."""
-        subject = self.subject
+        """Writes the system as it is, and reports what was written."""
+        session = self.session
         try:
             with self._lock:
-                said = tuning.save(
-                    self.folder, self.tuning.ik, subject.preset, subject.leg_length,
-                    drop=self._way_back.drop.value,
+                messages = tuning.save(
+                    self.folder, self.tuning.ik, session.preset, session.leg_length,
+                    drop=self._history.drop.value,
                 )  # fmt: skip
         except ValueError as error:
-            said = [str(error)]
-        self._way_back.said.content = "\n\n".join(map(literal, said))
+            messages = [str(error)]
+        self._history.message.content = "\n\n".join(map(literal, messages))
 
     def close(self) -> None:
         """Ends its threads."""
         self._player.close()
         self._latest.close()
 
-    def _move(self, knob: Knob, value: float | bool) -> None:
+    def _move(self, slider: Slider, value: float | bool) -> None:
         try:
             with self._lock:
-                self.tuning.change(knob.write(self.tuning.ik, value), knob.name, time.monotonic())
+                ik = slider.write(self.tuning.ik, value)
+                self.tuning.change(ik, slider.name, time.monotonic())
         except ValueError as error:
-            self._way_back.said.content = literal(str(error))
+            self._history.message.content = literal(str(error))
         self._latest.ask()
 
     def _step(self, way: str) -> None:
@@ -158,7 +159,7 @@ class Viewer:
         self._moved()
 
     def _moved(self) -> None:
-        self._knobs.follow(self.tuning.ik)
+        self._sliders.follow(self.tuning.ik)
         self._latest.ask()
 
     def _solve(self) -> None:
@@ -166,22 +167,22 @@ class Viewer:
             ik, solver, figure = self.tuning.ik, self.solver, self._figure
         try:
             if solver is not self._compiled:
-                self._way_back.cost.content = "Compiling, which takes a while the first time …"
+                self._history.cost.content = "Compiling, which takes a while the first time …"
                 solver.solve(ik)
                 self._compiled = solver
             solved = solver.solve(ik)
         except (ValueError, RuntimeError) as error:  # JAX raises the latter without memory
-            self._way_back.cost.content = f"**{literal(str(error))}**"
+            self._history.cost.content = f"**{literal(str(error))}**"
             return
         if solver is not self.solver:
             return  # another clip was chosen meanwhile, and has asked, too
         self.solved = solved
         figure.show(solved)
-        self._show_chosen()
+        self._update_layers()
         for name, start in self.tuning.starts.items():
             if start is ik and solved.cost is not None:
                 self.costs[name] = solved.cost
-        self._way_back.cost.content = cost_text(solver, solved, self.costs)
+        self._history.cost.content = cost_text(solver, solved, self.costs)
 
     def _draw_time(self, seconds: float) -> None:
         figure = self._figure
@@ -192,18 +193,18 @@ class Viewer:
     def _seek(self, frame: int) -> None:
         self._player.seek(frame / self._figure.fps)
 
-    def _show_chosen(self) -> None:
-        for name, box in self._shown.boxes.items():
+    def _update_layers(self) -> None:
+        for name, box in self._layers.boxes.items():
             self._figure.set_visible(name, box.value)
 
     def _choose(self, number: int) -> None:
-        """Shows another clip of the subject."""
+        """Shows another clip of the session."""
         with self._lock:
-            solver = Solver(self.subject, number)
+            solver = Solver(self.session, number)
             self._figure.remove()
             self.solver, self._figure = solver, Figure(self.server, solver)
             self._figure.follows = self._time.follow.value
-            self._show_chosen()
+            self._update_layers()
             clip = solver.animation.placed_clip
             self._player.seconds = clip.seconds
             self._time.frame.max = max(clip.frame_count - 1, 1)
@@ -351,19 +352,19 @@ class TimePanel:
             self.follow = gui.add_checkbox("Camera follows", True)
 
 
-class ShownPanel:
+class LayerPanel:
     """What is drawn."""
 
     def __init__(self, gui: viser.GuiApi, has_captured: bool):
-        with gui.add_folder("Shown"):
+        with gui.add_folder("Layers"):
             gui.add_markdown("Feet are red in the ground, purple where they slide.")
             names = [name for name in SKELETONS if name != "captured" or has_captured]
             self.boxes = {name: gui.add_checkbox(SKELETON_LABELS[name], True) for name in names}
             self.boxes |= {name: gui.add_checkbox(NAMES[name], False) for name in NAMES}
 
 
-class WayBackPanel:
-    """Undo, redo, reset and Save, with what they said."""
+class HistoryPanel:
+    """Undo, redo, reset and Save, with their messages."""
 
     def __init__(self, gui: viser.GuiApi, starts: Mapping[str, jaxik.FootIK]):
         self.cost = gui.add_markdown("")
@@ -374,57 +375,56 @@ class WayBackPanel:
             "Record without what it cannot hold", False,
             hint="Else there is no record of parameters that 128 bytes cannot hold.",
         )  # fmt: skip
-        self.said = gui.add_markdown("")
+        self.message = gui.add_markdown("")
 
 
-class KnobPanel:
+class SliderPanel:
     """A slider for each number and a box for each switch, in folders by stage.
 
     Args:
         gui: of the page.
-        knobs: stage by stage.
+        every: slider, stage by stage.
         ik: the system at first.
         moved: called when the user has moved one.
     """
 
-    def __init__(self, gui: viser.GuiApi, knobs: Iterable[Knob], ik: jaxik.FootIK, moved: Moved):
-        self._handles: list[tuple[Knob, viser.GuiInputHandle]] = []
-        ordered = list(knobs)
-        if free := [knob for knob in ordered if knob.is_free]:
+    def __init__(self, gui: viser.GuiApi, every: list[Slider], ik: jaxik.FootIK, moved: Moved):
+        self._handles: list[tuple[Slider, viser.GuiInputHandle]] = []
+        if free := [slider for slider in every if slider.is_free]:
             self._add_folder(gui, "Fitted parameters", free, ik, moved)
-        for stage, of_stage in groupby(ordered, key=lambda knob: knob.stage):
-            if rest := [knob for knob in of_stage if not knob.is_free]:
+        for stage, of_stage in groupby(every, key=lambda slider: slider.stage):
+            if rest := [slider for slider in of_stage if not slider.is_free]:
                 self._add_folder(gui, stage, rest, ik, moved)
 
     def _add_folder(
-        self, gui: viser.GuiApi, name: str, knobs: list[Knob], ik: jaxik.FootIK, moved: Moved
+        self, gui: viser.GuiApi, name: str, sliders: list[Slider], ik: jaxik.FootIK, moved: Moved
     ) -> None:
-        with gui.add_folder(name, expand_by_default=knobs[0].is_free):
-            for knob in knobs:
-                handle = _add_knob(gui, knob, ik)
-                handle.on_update(_callback(knob, handle, moved))
-                self._handles.append((knob, handle))
+        with gui.add_folder(name, expand_by_default=sliders[0].is_free):
+            for slider in sliders:
+                handle = _add_control(gui, slider, ik)
+                handle.on_update(_callback(slider, handle, moved))
+                self._handles.append((slider, handle))
 
     def follow(self, ik: jaxik.FootIK) -> None:
         """Moves sliders to where a system has its numbers."""
-        for knob, handle in self._handles:
-            handle.value = knob.shown(ik)
+        for slider, handle in self._handles:
+            handle.value = slider.clamped(ik)
 
 
-def _add_knob(gui: viser.GuiApi, knob: Knob, ik: jaxik.FootIK) -> viser.GuiInputHandle:
-    label = knob.name if knob.is_free else knob.label
-    value = knob.shown(ik)
+def _add_control(gui: viser.GuiApi, slider: Slider, ik: jaxik.FootIK) -> viser.GuiInputHandle:
+    label = slider.name if slider.is_free else slider.label
+    value = slider.clamped(ik)
     if isinstance(value, bool):
-        return gui.add_checkbox(label, value, hint=knob.hint)
-    return gui.add_slider(label, knob.low, knob.high, knob.step, value, hint=knob.hint)
+        return gui.add_checkbox(label, value, hint=slider.hint)
+    return gui.add_slider(label, slider.low, slider.high, slider.step, value, hint=slider.hint)
 
 
 def _callback(
-    knob: Knob, handle: viser.GuiInputHandle, moved: Moved
+    slider: Slider, handle: viser.GuiInputHandle, moved: Moved
 ) -> Callable[[viser.GuiEvent], None]:
     def on_update(event: viser.GuiEvent) -> None:
         if event.client is not None:  # else the page was moved, and not by a user
-            moved(knob, handle.value)
+            moved(slider, handle.value)
 
     return on_update
 
@@ -494,7 +494,7 @@ def cost_text(solver: Solver, solved: Solved, costs: Mapping[str, float]) -> str
     """
     motions = {"before": solver.before, "after": solved.motion, "captured": solver.captured}
     measured = {name: drawn.measures for name, drawn in motions.items() if drawn is not None}
-    table = markdown(transposed(figures_table("", measured, SHOWN)))
+    table = markdown(transposed(figures_table("", measured, MEASURES)))
     return "\n\n".join([_cost(solved, costs), table])
 
 
@@ -608,8 +608,8 @@ def _origins(wanted: re.Pattern[str] | None) -> Iterator[None]:
 def address(server: viser.ViserServer) -> str:
     """What to open in a browser."""
     host = server.get_host()
-    shown = "localhost" if host in ("0.0.0.0", "::") else host
-    return f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+    host = "localhost" if host in ("0.0.0.0", "::") else host
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 def stop(server: viser.ViserServer) -> None:

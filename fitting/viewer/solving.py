@@ -18,7 +18,7 @@ from jaxik.world import body
 from jaxik.world.similarity import similar
 from jaxik.world.terrain import Hit
 
-from .subject import Colour, Lines, Subject, Take, crosses, joined, lines
+from .session import Colour, Lines, Session, crosses, joined, lines
 
 IN_GROUND, SLIDES = (230, 30, 30), (214, 39, 214)  # colours, RGB
 
@@ -44,8 +44,8 @@ NAMES = {
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What a viewer sees of each foot in each frame."""
+class FootFaults:
+    """How deep each foot is in the ground, and how far it has slid, in each frame."""
 
     depth: Float64[np.ndarray, "frames legs"]
     """m in the ground, 0 above it and without any."""
@@ -77,8 +77,8 @@ class Sight:
         return np.round(colours).astype(np.uint8)
 
 
-def seen(feet: Soles, motion: Clip, animated: Clip) -> Sight:
-    """What a viewer sees of the feet of a motion.
+def foot_faults(feet: Soles, motion: Clip, animated: Clip) -> FootFaults:
+    """How deep and how far the feet of a motion are in the ground and slide.
 
     Args:
         feet: of the motion.
@@ -87,7 +87,7 @@ def seen(feet: Soles, motion: Clip, animated: Clip) -> Sight:
     """
     depth = np.maximum(-np.nan_to_num(feet.gap), 0.0)
     slide = np.nan_to_num(measures.travelled(motion, animated, feet.stance))
-    return Sight(depth, np.maximum(slide, 0.0), body.ratio(motion.rig))
+    return FootFaults(depth, np.maximum(slide, 0.0), body.ratio(motion.rig))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Drawn:
     bones: Lines
     feet: Lines
     """Coloured by what is wrong with them."""
-    sight: Sight
+    faults: FootFaults
     measures: Measures
 
 
@@ -114,17 +114,17 @@ class Solved:
 
 
 class Solver:
-    """Solves one clip of a subject again and again.
+    """Solves one clip of a session again and again.
 
     Args:
-        subject: what is viewed.
+        session: what is viewed.
         number: index of the clip.
     """
 
-    def __init__(self, subject: Subject, number: int = 0):
-        self.subject = subject
-        self.take = subject.takes[number]
-        self.animation = self.take.animation
+    def __init__(self, session: Session, number: int = 0):
+        self.session = session
+        self.clip = session.clips[number]
+        self.animation = self.clip.animation
         self.before = self._drawn(self.animation.placed_clip, "before")
         captured = self.animation.captured
         self.captured = None if captured is None else self._drawn(captured, "captured")
@@ -143,31 +143,25 @@ class Solver:
             ValueError: the poses are not finite.
         """
         began, own = time.perf_counter(), self.animation
-        cost = None if self.subject.cost is None else self.subject.cost(ik)  # runs meanwhile
-        result = jax.tree.map(np.asarray, result_of(ik, self.take))
+        cost = None if self.session.cost is None else self.session.cost(ik)  # runs meanwhile
+        size = self.clip.size
+        result = self.animation.run(ik if size is None else similar(ik, size))
+        result = jax.tree.map(np.asarray, result)
         solved = clip_from_result(own.clip, result, floor=own.floor, rise=own.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite")
-        motion = self._drawn(solved, "after")
-        shown = overlays(result, solved)
+        motion, layers = self._drawn(solved, "after"), overlays(result, solved)
         cost = None if cost is None else float(cost)
-        return Solved(motion, shown, cost, time.perf_counter() - began)
+        return Solved(motion, layers, cost, time.perf_counter() - began)
 
     @in_float64
     def _drawn(self, clip: Clip, name: str) -> Drawn:
         placed = self.animation.place(clip)
-        sight = seen(placed.soles, clip, self.animation.own_speed)
+        faults = foot_faults(placed.soles, clip, self.animation.own_speed)
         bones = np.array([[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0])
         starts, ends = np.moveaxis(clip.positions_ws[:, bones], 2, 0)
-        feet = _feet(placed, sight.colours(SKELETONS[name]))
-        return Drawn(lines(starts, ends, SKELETONS[name]), feet, sight, placed.measures)
-
-
-@in_float64
-def result_of(ik: jaxik.FootIK, take: Take) -> jaxik.Result:
-    """The result of a system on a clip, by the program that fits and commands use, too."""
-    own = ik if take.size is None else similar(ik, take.size)
-    return take.animation.run(own)
+        feet = _feet(placed, faults.colours(SKELETONS[name]))
+        return Drawn(lines(starts, ends, SKELETONS[name]), feet, faults, placed.measures)
 
 
 def _feet(motion: PlacedMotion, colours: np.ndarray) -> Lines:
@@ -180,7 +174,7 @@ def _feet(motion: PlacedMotion, colours: np.ndarray) -> Lines:
 
 
 def overlays(result: jaxik.Result, solved: Clip) -> dict[str, Lines]:
-    """What is shown on demand, by name, in world space.
+    """What is drawn on demand, by name, in world space.
 
     Args:
         result: of a system.
@@ -208,7 +202,7 @@ def _rays(hit: Hit, up_ws: np.ndarray) -> Lines:
     """The rays that end in these hits; those that were not cast have no length."""
     ends = np.asarray(hit.point)
     starts = ends + np.asarray(hit.distance)[..., None] * up_ws
-    colours = np.where(np.asarray(hit.found)[..., None] > 0.5, _byte(FOUND), _byte(MISSED))
+    colours = np.where(np.asarray(hit.found)[..., None] > 0.5, FOUND, MISSED).astype(np.uint8)
     return lines(starts, ends, colours)
 
 
@@ -220,7 +214,3 @@ def _reach(solved: Clip, target_ws: np.ndarray) -> Lines:
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
     ends = hips + np.minimum(length / distance, 1.0)[..., None] * offset
     return joined(lines(hips, ends, WITHIN), lines(ends, target_ws, BEYOND))
-
-
-def _byte(colour: Colour) -> np.ndarray:
-    return np.array(colour, np.uint8)

@@ -42,16 +42,6 @@ class Tuning:
         with self._lock:
             return self._ik
 
-    @property
-    def can_undo(self) -> bool:
-        """Whether there is a step to undo."""
-        return bool(self._done)
-
-    @property
-    def can_redo(self) -> bool:
-        """Whether there is a step to do again."""
-        return bool(self._undone)
-
     def change(self, ik: jaxik.FootIK, what: str, now: float) -> None:
         """Takes a changed system.
 
@@ -101,7 +91,7 @@ def save(
     *,
     drop: bool = False,
 ) -> list[str]:
-    """Writes a system under names that are not taken; says what was written, and what was not.
+    """Writes a system under names that are not taken; returns what was written, and what was not.
 
     The record is read from the file of parameters, as `jaxik record to-bytes` does.
 
@@ -120,18 +110,18 @@ def save(
     """
     toml, binary = _free_names(folder)
     files.write_text(toml, parameter_files.system_to_toml(ik, preset, leg_length))
-    said = [f"Parameters are in {toml}."]
+    messages = [f"Parameters are in {toml}."]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             (entry,) = record_files.read(toml, record.Reading(), None, drop=drop)
         except ValueError as error:
             reason = str(error).removeprefix(f"{toml}: ")
-            return [*said, f"No record is written: {reason.partition('. To leave')[0]}."]
+            return [*messages, f"No record is written: {reason.partition('. To leave')[0]}."]
     content = record.to_bytes(entry)
     files.write(binary, lambda path: path.write_bytes(content))
     notes = [f"Note: {warning.message}." for warning in caught]
-    return [*said, f"The record is in {binary}.", *notes]
+    return [*messages, f"The record is in {binary}.", *notes]
 
 
 def _free_names(folder: Path) -> tuple[Path, Path]:

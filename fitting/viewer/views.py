@@ -20,7 +20,7 @@ from fitting.runtime import activity
 EXTRA = 'needs viser: pip install "jaxik[view]"'
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 BEST = "best so far"
-EVERY = 0.5  # s, at least, between two points of a fit that are shown
+EVERY = 0.5  # s, at least, between two points of a fit that are drawn
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Address:
 
 
 @contextmanager
-def opened(subject: viewer.Subject, folder: Path, address: Address = Address()) -> Iterator[Any]:
+def opened(session: viewer.Session, folder: Path, address: Address = Address()) -> Iterator[Any]:
     """A `fitting.viewer.page.Viewer` while it is open.
 
     Args:
-        subject: what is viewed.
+        session: what is viewed.
         folder: where Save writes.
         address: of the page.
 
@@ -52,17 +52,17 @@ def opened(subject: viewer.Subject, folder: Path, address: Address = Address()) 
         )
         stack.callback(page.stop, server)
         with activity.announced("Preparing the page"):
-            shown = page.Viewer(server, subject, folder)
-        stack.callback(shown.close)
-        activity.log(f"{subject.title}: open {page.address(server)} in a browser")
+            viewer_page = page.Viewer(server, session, folder)
+        stack.callback(viewer_page.close)
+        activity.log(f"{session.title}: open {page.address(server)} in a browser")
         if address.host not in LOOPBACK:
             note = f"note: whoever reaches {address.host} can move sliders, and save into {folder}"
             activity.log(note)
-        yield shown
+        yield viewer_page
 
 
 def view(
-    subject: viewer.Subject,
+    session: viewer.Session,
     folder: str | Path,
     address: Address = Address(),
     *,
@@ -75,7 +75,7 @@ def view(
     """
     event = until or threading.Event()
     try:
-        with opened(subject, Path(folder), address):
+        with opened(session, Path(folder), address):
             while not event.wait(0.5):
                 pass
     except KeyboardInterrupt:
@@ -90,7 +90,7 @@ def view_run(run: str | Path, folder: str | Path | None, address: Address = Addr
     """
     if folder is not None:
         check_folder(Path(folder))
-    view(viewer.subject_of_run(Path(run)), folder or run, address)
+    view(viewer.session_of_run(Path(run)), folder or run, address)
 
 
 def check_folder(folder: Path) -> None:
@@ -119,7 +119,7 @@ class FitWatch(activity.Watcher):
     """The `fitting.viewer.page.Viewer`, once there is one."""
     _page: ExitStack = field(default_factory=ExitStack, repr=False)
     _problem: Problem[jaxik.FootIK] | None = field(default=None, repr=False)
-    _shown: tuple[float, float] = (float("inf"), float("-inf"))  # cost, and when it was shown
+    _last: tuple[float, float] = (float("inf"), float("-inf"))  # cost, and when it was drawn
 
     def __enter__(self) -> "FitWatch":
         _page()
@@ -133,7 +133,7 @@ class FitWatch(activity.Watcher):
         if isinstance(result, LoadedExperiment):
             self._problem = result.problem
             page = opened(
-                viewer.subject_of_fit(result.experiment, result.problem, result.clips),
+                viewer.session_of_fit(result.experiment, result.problem, result.clips),
                 self.folder,
                 self.address,
             )
@@ -142,11 +142,11 @@ class FitWatch(activity.Watcher):
             self._show(result, self._problem)
 
     def _show(self, report: Report, problem: Problem[jaxik.FootIK]) -> None:
-        """Shows the best point where it is another than the one shown."""
-        cost, when = self._shown
+        """Shows the best point where it differs from the last one."""
+        cost, when = self._last
         now = time.monotonic()
         if report.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
-            self._shown = (report.best, now)
+            self._last = (report.best, now)
             ik = alone(problem.space.unpack(report.best_u))
             note = f"The fit goes on: {report.stage}, best cost {report.best:.6g}."
             self.viewer.restart(BEST, ik, note)

@@ -394,10 +394,10 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
 
 
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
-    subject = throughput.subject(12)
-    (take,), (system,) = subject.takes, subject.starts.values()
-    assert take.animation.clip.fps == throughput.RATE and take.animation.clip.frame_count == 6
-    assert system.leg is not None and subject.cost is not None
+    session = throughput.session(12)
+    (clip,), (system,) = session.clips, session.starts.values()
+    assert clip.animation.clip.fps == throughput.RATE and clip.animation.clip.frame_count == 6
+    assert system.leg is not None and session.cost is not None
     problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
     count = max(workloads.FULL.parameters)
@@ -464,10 +464,10 @@ def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_ste
 def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     systems = []
     ik, clip = presets.record(), workloads.walk(12)
-    subject = SimpleNamespace(starts={throughput.DEFAULT: ik}, rig=clip.rig)
+    session = SimpleNamespace(starts={throughput.DEFAULT: ik}, rig=clip.rig)
     solver = SimpleNamespace(solve=systems.append, animation=SimpleNamespace(clip=clip))
-    monkeypatch.setattr(throughput, "subject", lambda frame_count: subject)
-    monkeypatch.setattr(throughput, "Solver", lambda subject: solver)
+    monkeypatch.setattr(throughput, "session", lambda frame_count: session)
+    monkeypatch.setattr(throughput, "Solver", lambda session: solver)
     timings = measure("view")
     (figure,) = timings.figures
     assert figure.at_most == 100.0 and figure.unit == "ms"

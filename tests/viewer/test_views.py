@@ -21,8 +21,8 @@ from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.fit.fit_motions import saved_clips
 from fitting.viewer import Solver, solving, tuning, views
 from fitting.viewer.page import Latest
-from fitting.viewer.solving import IN_GROUND, Sight, seen
-from fitting.viewer.subject import Lines, knobs
+from fitting.viewer.session import Lines, sliders
+from fitting.viewer.solving import IN_GROUND, FootFaults, foot_faults
 from fitting.viewer.tuning import PAUSE, Tuning
 from fitting.viewer.views import Address, FitWatch
 from jaxik import presets, record
@@ -42,30 +42,31 @@ def ik():
 
 @pytest.fixture(scope="module")
 def by_name(ik):
-    return {knob.name: knob for knob in knobs(ik)}
+    return {slider.name: slider for slider in sliders(ik)}
 
 
-def test_every_parameter_and_switch_has_a_knob_and_fitted_ones_the_range_of_their_fit(ik, by_name):
+def test_every_parameter_and_switch_has_a_slider_and_fitted_ones_their_own_range(ik, by_name):
     declared = set(parameter_tree.declarations(ik))
     switches = {slot.name for slot in parameter_tree.slots(ik) if slot.value.dtype == bool}
-    assert {knob.leaf for knob in by_name.values()} == declared | switches
+    assert {slider.leaf for slider in by_name.values()} == declared | switches
     toes = [name for name in by_name if name.startswith("probe.toe_ls")]
     assert toes == [f"probe.toe_ls[{i}]" for i in range(3)]
     free = [free_parameter(ik, "foot.max_pitch", low=0.1, high=0.2)]
-    fitted = [knob for knob in knobs(ik, free=free) if knob.is_free]
-    assert [(knob.name, knob.low, knob.high) for knob in fitted] == [("foot.max_pitch", 0.1, 0.2)]
-    for knob in by_name.values():
-        assert knob.low <= knob.shown(ik) <= knob.high
-        assert 0 < knob.step <= (knob.high - knob.low) / 100
+    fitted = [slider for slider in sliders(ik, free=free) if slider.is_free]
+    ranges = {slider.name: (slider.low, slider.high) for slider in fitted}
+    assert ranges == {"foot.max_pitch": (0.1, 0.2)}
+    for slider in by_name.values():
+        assert slider.low <= slider.clamped(ik) <= slider.high
+        assert 0 < slider.step <= (slider.high - slider.low) / 100
 
 
-def test_a_knob_changes_its_own_number_and_no_other(ik, by_name):
+def test_a_slider_changes_its_own_number_and_no_other(ik, by_name):
     for name in ("pelvis.limit", "probe.toe_ls[2]", "lock.enabled"):
-        knob = by_name[name]
-        value = (not knob.read(ik)) if knob.is_switch else 0.5 * (knob.low + knob.high)
-        moved = knob.write(ik, value)
-        assert knob.read(moved) == pytest.approx(value)
-        others = [other for other in by_name.values() if other is not knob]
+        slider = by_name[name]
+        value = (not slider.read(ik)) if slider.is_switch else 0.5 * (slider.low + slider.high)
+        moved = slider.write(ik, value)
+        assert slider.read(moved) == pytest.approx(value)
+        others = [other for other in by_name.values() if other is not slider]
         assert [other.read(moved) for other in others] == [other.read(ik) for other in others]
 
 
@@ -83,38 +84,42 @@ def test_a_number_is_within_its_range_however_a_page_rounds_it_and_in_the_order_
 
 
 def test_undo_redo_and_reset(ik, by_name):
-    knob, other = by_name["pelvis.limit"], by_name["foot.max_pitch"]
+    slider, other = by_name["pelvis.limit"], by_name["foot.max_pitch"]
     tuning = Tuning({"fitted": ik, "default": presets.ozz()})
     for i, now in enumerate((0.0, 0.1, 0.2)):  # one drag
-        tuning.change(knob.write(ik, 0.1 + 0.01 * i), knob.name, now)
+        tuning.change(slider.write(ik, 0.1 + 0.01 * i), slider.name, now)
     dragged = tuning.ik
     tuning.change(other.write(dragged, 0.2), other.name, 0.3)
     tuning.undo()
     assert tuning.ik is dragged
     tuning.undo()
-    assert tuning.ik is ik and not tuning.can_undo
+    assert tuning.ik is ik
+    tuning.undo()
+    assert tuning.ik is ik, "there is no step before the first"
     tuning.redo()
-    assert tuning.ik is dragged and tuning.can_redo
+    assert tuning.ik is dragged
     tuning.reset("default")
-    assert tuning.ik is tuning.starts["default"] and not tuning.can_redo
+    assert tuning.ik is tuning.starts["default"]
+    tuning.redo()
+    assert tuning.ik is tuning.starts["default"], "a new step replaces those undone"
     tuning.undo()
     assert tuning.ik is dragged
     tuning = Tuning({"default": ik})  # a pause begins a new step
-    tuning.change(dragged, knob.name, 0.0)
-    tuning.change(knob.write(ik, 0.2), knob.name, 2 * PAUSE)
+    tuning.change(dragged, slider.name, 0.0)
+    tuning.change(slider.write(ik, 0.2), slider.name, 2 * PAUSE)
     tuning.undo()
     assert tuning.ik is dragged
 
 
 def test_what_is_saved_is_read_again_but_no_record_that_would_lose_something_is_written(tmp_path):
     ik = presets.record(faithful=True)
-    knob = next(knob for knob in knobs(ik) if knob.name == "pelvis.limit")
-    said = tuning.save(tmp_path, knob.write(ik, 0.123), FAITHFUL)
+    slider = next(slider for slider in sliders(ik) if slider.name == "pelvis.limit")
+    said = tuning.save(tmp_path, slider.write(ik, 0.123), FAITHFUL)
     tuning.save(tmp_path, ik, FAITHFUL)
     loaded, preset = parameter_files.load_system(tmp_path / "tuned.toml")
     content = (tmp_path / "tuned.bin").read_bytes()
     for read in (loaded, record.to_ik(record.from_bytes(content))):
-        assert knob.read(read) == pytest.approx(0.123)
+        assert slider.read(read) == pytest.approx(0.123)
     assert preset == FAITHFUL and (tmp_path / "tuned_2.toml").exists()
     assert "knee" in said[-1]  # the bytes hold more than parameters
     ik = parameter_tree.replace(ik, {"leg.soften": 0.9})
@@ -168,7 +173,7 @@ def fitted(tmp_path_factory):
 def solver(fitted, tmp_path_factory) -> Solver:
     run = tmp_path_factory.mktemp("run")
     runs.save(run, fitted)
-    return Solver(viewer.subject_of_run(run))
+    return Solver(viewer.session_of_run(run))
 
 
 def ends(lines: Lines) -> np.ndarray:
@@ -176,19 +181,19 @@ def ends(lines: Lines) -> np.ndarray:
 
 
 def test_a_run_begins_with_the_motion_and_cost_of_its_fit_with_rays_and_targets(fitted, solver):
-    subject = solver.subject
-    assert list(subject.starts) == ["fitted", "before", "default"]
+    session = solver.session
+    assert list(session.starts) == ["fitted", "before", "default"]
     for name in ("pelvis.on_gain", "foot.max_pitch"):
-        value = parameter_tree.get(subject.starts["fitted"], name)
+        value = parameter_tree.get(session.starts["fitted"], name)
         assert float(value) == pytest.approx(float(parameter_tree.get(fitted.ik, name)))
-    assert bool(parameter_tree.get(subject.starts["default"], "lock.enabled"))
-    solved = {name: solver.solve(subject.starts[name]) for name in ("fitted", "before")}
+    assert bool(parameter_tree.get(session.starts["default"], "lock.enabled"))
+    solved = {name: solver.solve(session.starts[name]) for name in ("fitted", "before")}
     joints = saved_clips(fitted)["fitted.npz"].positions_ws
     shown = ends(solved["fitted"].motion.bones)
     gaps = np.linalg.norm(shown[:, :, None] - joints[:, None], axis=-1).min(axis=2)
     assert gaps.max() < 1e-9
     for name, shown in solved.items():
-        u = fitted.problem.space.pack(subject.starts[name])
+        u = fitted.problem.space.pack(session.starts[name])
         assert shown.cost == pytest.approx(float(fitted.problem.cost(u)), rel=1e-9)
     overlays, motion = solved["fitted"].overlays, solved["fitted"].motion
     rays = overlays["rays"].points  # which end on the ground, as targets are where ankles are
@@ -204,9 +209,10 @@ def test_a_run_begins_with_the_motion_and_cost_of_its_fit_with_rays_and_targets(
 def test_any_parameter_moves_the_feet_and_the_cost_and_poses_are_finite_or_refused(
     solver, monkeypatch
 ):
-    ik = solver.subject.starts["fitted"]
-    (knob,) = [knob for knob in knobs(ik, solver.subject.rig) if knob.name == "probe.ray_down"]
-    before, after = solver.solve(ik), solver.solve(knob.write(ik, 0.0))
+    ik = solver.session.starts["fitted"]
+    by_name = {slider.name: slider for slider in sliders(ik, solver.session.rig)}
+    slider = by_name["probe.ray_down"]
+    before, after = solver.solve(ik), solver.solve(slider.write(ik, 0.0))
     assert np.abs(ends(after.motion.feet) - ends(before.motion.feet)).max() > 0.01
     assert after.cost != before.cost
 
@@ -219,8 +225,8 @@ def test_any_parameter_moves_the_feet_and_the_cost_and_poses_are_finite_or_refus
 
 
 def test_deep_feet_are_red_and_sliding_ones_purple_counted_from_the_beginning_of_a_stance(solver):
-    sight = Sight(np.array([[0.0, VISIBLE, 0.0]]), np.array([[0.0, 0.0, VISIBLE]]))
-    plain, deep, slid = sight.colours((10, 20, 30))[0].tolist()
+    faults = FootFaults(np.array([[0.0, VISIBLE, 0.0]]), np.array([[0.0, 0.0, VISIBLE]]))
+    plain, deep, slid = faults.colours((10, 20, 30))[0].tolist()
     assert plain == [10, 20, 30] and deep == list(IN_GROUND) and slid[0] > 200 < slid[2]
     clip = solver.animation.placed_clip
     stance = np.zeros((clip.frame_count, 2), bool)
@@ -229,19 +235,19 @@ def test_deep_feet_are_red_and_sliding_ones_purple_counted_from_the_beginning_of
     still = dataclasses.replace(clip, positions_ws=np.repeat(clip.positions_ws[:1], 7, axis=0))
     moved = dataclasses.replace(still, positions_ws=still.positions_ws + drift)
     soles = Soles(np.zeros((7, 2, 2, 3)), np.full((7, 2, 2), -0.03), np.zeros((7, 2, 2)), stance)
-    sight = seen(soles, moved, still)
-    np.testing.assert_allclose(sight.slide[:, 0], [0, 0, 0.01, 0.02, 0, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(sight.depth, 0.03)
-    assert not sight.slide[:, 1].any()
+    faults = foot_faults(soles, moved, still)
+    np.testing.assert_allclose(faults.slide[:, 0], [0, 0, 0.01, 0.02, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(faults.depth, 0.03)
+    assert not faults.slide[:, 1].any()
 
 
 def test_a_clip_is_shown_as_jaxik_run_solves_it(fitted, tmp_path):
     files = AnimationFiles(tmp_path / "flat.npz", GROUND)
     save_clip(files.clip, fitted.clips[0].base)
-    subject = viewer.subject_of_animation(files, Preset("record"))
-    assert list(subject.starts) == ["default"] and subject.cost is None
-    shown = Solver(subject).solve(subject.starts["default"])
-    _, solved = load_animation(files).solve(subject.starts["default"])
+    session = viewer.session_of_animation(files, Preset("record"))
+    assert list(session.starts) == ["default"] and session.cost is None
+    shown = Solver(session).solve(session.starts["default"])
+    _, solved = load_animation(files).solve(session.starts["default"])
     np.testing.assert_allclose(shown.motion.feet.points[:, :2, 0], solved.joints_ws(2), atol=1e-9)
     assert shown.cost is None
 
@@ -288,11 +294,11 @@ def test_what_cannot_be_shown_costs_one_line(capsys, tmp_path, monkeypatch):
 
 @needs_viser
 def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
-    subject = viewer.subject_of_fit(fitted.experiment, fitted.problem, fitted.clips)
-    (take,) = subject.takes
-    takes = (take, dataclasses.replace(take, name="again"))
-    subject = dataclasses.replace(subject, title="<img src=x onerror=run()>", takes=takes)
-    with views.opened(subject, tmp_path, Address(port=0)) as shown:
+    session = viewer.session_of_fit(fitted.experiment, fitted.problem, fitted.clips)
+    (clip,) = session.clips
+    clips = (clip, dataclasses.replace(clip, name="again"))
+    session = dataclasses.replace(session, title="<img src=x onerror=run()>", clips=clips)
+    with views.opened(session, tmp_path, Address(port=0)) as shown:
         assert shown.wait(300)
         first = shown.solver
         shown._player.play(True)

@@ -41,7 +41,7 @@ STEPS = 400  # of a slider over its range, at least
 
 
 @dataclass(frozen=True)
-class Take:
+class SessionClip:
     """One clip on its ground."""
 
     name: str
@@ -52,13 +52,13 @@ class Take:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What a viewer is about."""
+class Session:
+    """What a viewer shows, and what it can change."""
 
     title: str
-    takes: tuple[Take, ...]
+    clips: tuple[SessionClip, ...]
     starts: Mapping[str, jaxik.FootIK]
-    """The systems to go back to, by name; the first is shown at first."""
+    """The systems to go back to, by name; it begins with the first."""
     preset: Preset
     """Of which they differ."""
     free: tuple[FreeParameter, ...] = ()
@@ -71,7 +71,7 @@ class Subject:
     @property
     def rig(self) -> jaxik.Rig:
         """The body on which the ranges of parameters depend."""
-        return self.takes[0].animation.clip.rig
+        return self.clips[0].animation.clip.rig
 
 
 @cached
@@ -88,7 +88,7 @@ def cost_of_scenes(scenes: tuple[Scene, ...], ik: jaxik.FootIK) -> Float[Array, 
 
 
 @in_float64
-def subject_of_run(run: Path) -> Subject:
+def session_of_run(run: Path) -> Session:
     """The clips of a run, its fitted system, and the cost of its fit.
 
     Raises:
@@ -101,17 +101,17 @@ def subject_of_run(run: Path) -> Subject:
         problem = with_noise(problem, NoiseModel(**summary["noise"]))
     values = {row["name"]: row["u"] for row in summary["parameters"]}
     u = np.array([values[name] for name in problem.space.names])
-    subject = subject_of_fit(experiment, problem, clips, u)
-    return with_start(subject, FITTED, alone(problem.space.unpack(u)))
+    session = session_of_fit(experiment, problem, clips, u)
+    return with_start(session, FITTED, alone(problem.space.unpack(u)))
 
 
 @in_float64
-def subject_of_fit(
+def session_of_fit(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     clips: tuple[ClipData, ...],
     u: Vector | None = None,
-) -> Subject:
+) -> Session:
     """The clips of an experiment, and its system as it is before the fit.
 
     Args:
@@ -125,8 +125,8 @@ def subject_of_fit(
     default = with_floats(experiment.preset_system(rig), np.float64)
     if any(clip.root.rise is not None for clip in clips):
         default = systems.without_own_root(default)
-    takes = tuple(
-        Take(
+    session_clips = tuple(
+        SessionClip(
             name=scene.reference.label if len(clips) == 1 else f"{number}: {clip.base.source}",
             animation=Animation(
                 clip.base,
@@ -143,9 +143,9 @@ def subject_of_fit(
     cost = partial(cost_of_problem, problem)
     if experiment.capture:  # then the problem is one of more than a system
         cost = partial(cost_of_scenes, scenes)
-    return Subject(
+    return Session(
         title=experiment.name,
-        takes=takes,
+        clips=session_clips,
         starts={"before": alone(problem.space.system), DEFAULT: default},
         preset=Preset(experiment.preset, experiment.faithful),
         free=tuple(p for p in problem.space.parameters if not is_of_capture(p.name)),
@@ -155,21 +155,21 @@ def subject_of_fit(
 
 
 @in_float64
-def subject_of_animation(
-    files: AnimationFiles, preset: Preset, given: jaxik.FootIK | None = None
-) -> Subject:
+def session_of_animation(
+    files: AnimationFiles, preset: Preset, start: jaxik.FootIK | None = None
+) -> Session:
     """A flat animation on a terrain; its cost too, where the file has the captured motion.
 
     Args:
         files: the clip, the terrain, and where the root is put.
         preset: what the sliders go back to.
-        given: the system to begin with; None is the preset.
+        start: the system to begin with; None is the preset.
 
     Raises:
         ValueError: a file cannot be read, or the system does not fit the clip.
     """
     loaded = load_animation(files)
-    names = {DEFAULT: preset.system(loaded.clip.rig)} | ({GIVEN: given} if given else {})
+    names = {DEFAULT: preset.system(loaded.clip.rig)} | ({GIVEN: start} if start else {})
     starts = {name: with_floats(ik, np.float64) for name, ik in reversed(names.items())}
     if loaded.root.rise is not None:
         starts = {name: systems.without_own_root(ik) for name, ik in starts.items()}
@@ -182,14 +182,13 @@ def subject_of_animation(
             data = ClipData(captured, loaded.clip, terrain, loaded.root, loaded.tracks)
             cost = partial(cost_of_scenes, (problems.make_scene(data, {}),))
     prepared = replace(loaded, terrain=terrain, given_frames=loaded.frames, captured=captured)
-    take = Take(files.clip.name, prepared)
     title = f"{files.clip.name} on {files.terrain.name}"
-    return Subject(title, (take,), starts, preset, cost=cost)
+    return Session(title, (SessionClip(files.clip.name, prepared),), starts, preset, cost=cost)
 
 
-def with_start(subject: Subject, name: str, ik: jaxik.FootIK) -> Subject:
-    """The subject with one more system to go back to, which is shown at first."""
-    return replace(subject, starts={name: ik, **subject.starts})
+def with_start(session: Session, name: str, ik: jaxik.FootIK) -> Session:
+    """The session with one more system to go back to, with which it begins."""
+    return replace(session, starts={name: ik, **session.starts})
 
 
 class Lines(NamedTuple):
@@ -238,7 +237,7 @@ def joined(*parts: Lines) -> Lines:
 
 
 @dataclass(frozen=True)
-class Knob:
+class Slider:
     """One number or switch of a system, or one element of an array of them."""
 
     name: str
@@ -289,8 +288,8 @@ class Knob:
         value = np.asarray(parameter_tree.get(ik, self.leaf))[self.index]
         return bool(value) if self.is_switch else float(value)
 
-    def shown(self, ik: jaxik.FootIK) -> float | bool:
-        """The value as a slider can show it: within its range."""
+    def clamped(self, ik: jaxik.FootIK) -> float | bool:
+        """The value moved into the range."""
         value = self.read(ik)
         return value if self.is_switch else min(max(value, self.low), self.high)
 
@@ -319,9 +318,9 @@ class Knob:
         return value
 
 
-def knobs(
+def sliders(
     ik: jaxik.FootIK, rig: jaxik.Rig | None = None, free: Sequence[FreeParameter] = ()
-) -> list[Knob]:
+) -> list[Slider]:
     """The parameters and switches of a system, stage by stage.
 
     Args:
@@ -336,7 +335,7 @@ def knobs(
         for name, declaration in declared.items()
         if declaration.above is not None
     }
-    made = []
+    every = []
     for slot in parameter_tree.slots(ik):
         value = np.asarray(slot.value)
         declaration, is_switch = declared.get(slot.name), value.dtype == bool
@@ -345,8 +344,8 @@ def knobs(
         own = fitted.get(slot.name, declaration)
         low, high = (0.0, 1.0) if own is None else (own.low, own.high)
         for index in np.ndindex(value.shape):
-            made.append(
-                Knob(
+            every.append(
+                Slider(
                     name=slot.name + "".join(f"[{i}]" for i in index),
                     leaf=slot.name,
                     index=index,
@@ -360,4 +359,4 @@ def knobs(
                     is_free=slot.name in fitted,
                 )
             )
-    return made
+    return every
