@@ -7,10 +7,12 @@ import os
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
 
 from fitting.inference.optimise.search import find_best_fit
 from fitting.inference.optimise.solution import Solution
@@ -19,7 +21,7 @@ from fitting.inference.sample.posterior import WalkerStart, sample_posterior
 from fitting.problem.problem import Problem
 from fitting.runtime.threads import usable_cores
 
-from . import kernels, workloads
+from . import workloads
 from .measurement import Call, Measurement, call_in_process, time_calls
 from .workloads import Sizes
 
@@ -89,7 +91,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
     """The whole search for twenty parameters: warm, cold, and SciPy's."""
     problem = workloads.problem(sizes.frames)
     solutions: list[Solution] = []
-    descents: dict[str, kernels.Descent] = {}
+    descents: dict[str, OptimizeResult] = {}
 
     def ours() -> None:
         solution = find_best_fit(problem)
@@ -98,7 +100,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
         solutions.append(solution)
 
     def scipy(name: str) -> Call:
-        descend = kernels.least_squares_with_scipy(problem, our_jacobian=SCIPY[name])
+        descend = _least_squares_with_scipy(problem, our_jacobian=SCIPY[name])
         return lambda: descents.update({name: descend()})
 
     start = problem.space.start
@@ -113,7 +115,7 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
     measurement.notes.append(f"seconds by stage: {_stages(solution)}; {solution.message}")
     for name, descent in descents.items():
         measurement.add_ratio(name, "ours", f"{name}: its time in ours")
-        counts = f"{descent.evaluations} evaluations and {descent.jacobians} Jacobians"
+        counts = f"{descent.nfev} evaluations and {descent.njev} Jacobians"
         measurement.add_timing(name, name, note=f"cost {descent.cost:.1f}; {counts}")
     if not sizes.cold:
         measurement.notes.append("cold fits, and SciPy with differences, are left out")
@@ -124,6 +126,23 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
         note = f"a process of its own, imports and clip included; the search in it {search:.1f} s"
         name = f"cold, {cache} cache"
         measurement.add_timing(name, name, at_most=target, note=note)
+
+
+def _least_squares_with_scipy(
+    problem: Problem, *, our_jacobian: bool
+) -> Callable[[], OptimizeResult]:
+    """SciPy's `least_squares` from the space's start, with our Jacobian or finite differences.
+
+    The residuals are ours and compiled in both cases. It stops at our solver's tolerance.
+    """
+
+    def compiled(function: Callable[[Problem, jax.Array], jax.Array]) -> Callable:
+        program = jax.jit(function)
+        return lambda u: np.asarray(program(problem, jnp.asarray(u)))
+
+    jacobian = compiled(lambda problem, u: problem.jacobian(u)) if our_jacobian else "2-point"
+    start = np.asarray(problem.space.start, float)
+    return functools.partial(least_squares, compiled(_residuals), start, jac=jacobian, ftol=1e-6)
 
 
 def _stages(solution: Solution) -> str:

@@ -12,12 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
-from scipy.optimize import least_squares
 
 import jaxik
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.ground import meshes
-from fitting.problem.problem import Problem
 from fitting.runtime.threads import cpu_block, usable_cores
 from jaxik.stages.effector import Effector
 from jaxik.stages.inputs import Inputs
@@ -25,7 +23,7 @@ from jaxik.stages.leg import LegGoal, SolvedLeg, TwoBone
 from jaxik.world.terrain import Hit, Terrain, cast, plane
 
 from . import workloads
-from .measurement import Call, Figure, Measurement, time_in_width
+from .measurement import Call, Measurement, time_in_width
 from .workloads import Sizes
 
 Vectors = Float[np.ndarray, "legs 3"]
@@ -46,21 +44,13 @@ class Legs(NamedTuple):
     target: Vectors
 
 
-class KneeLimits(NamedTuple):
-    """Limits of a knee, as parameters of `jaxik.stages.leg.TwoBone`."""
-
-    min_angle: float
-    """Radians."""
-    max_angle: float
-    """Radians."""
-    soften: float
-    """Fraction of the longest reach from which on the leg resists."""
-
-
-def two_bone(legs: Legs, limits: KneeLimits) -> tuple[Rotations, Rotations]:
+def two_bone(
+    legs: Legs, min_angle: float, max_angle: float, soften: float
+) -> tuple[Rotations, Rotations]:
     """Corrections of hips and knees, as `jaxik.stages.leg.TwoBone` makes them, by the cosine law.
 
-    Legs that are straight or folded, or that lie along their hinge, are not handled.
+    Legs that are straight or folded, or that lie along their hinge, are not handled. The other
+    arguments are those of `TwoBone`: the angles of its knee, rad, and its softening.
     """
     hinge = _rotate(legs.knee_rot, legs.knee_axis_ls)
     to_hip, to_ankle = legs.hip - legs.knee, legs.ankle - legs.knee
@@ -68,13 +58,13 @@ def two_bone(legs: Legs, limits: KneeLimits) -> tuple[Rotations, Rotations]:
     thigh, shin, distance = (np.linalg.norm(v, axis=-1) for v in (to_hip, to_ankle, to_target))
     shortest, longest = (
         np.sqrt(thigh**2 + shin**2 - 2.0 * thigh * shin * np.cos(angle))
-        for angle in (limits.min_angle, limits.max_angle)
+        for angle in (min_angle, max_angle)
     )
-    start = limits.soften * longest
+    start = soften * longest
     room = longest - start
     beyond = np.maximum(distance - start, 0.0)
     soft = np.minimum(distance, start)
-    if limits.soften < 1:
+    if soften < 1:
         soft += room * (1.0 - np.exp(-beyond / room))
     reach = np.clip(soft, shortest, longest)
 
@@ -132,37 +122,6 @@ def _arc(a: Vectors, b: Vectors) -> Rotations:
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
-class Descent(NamedTuple):
-    """What SciPy reached, and how often it called us."""
-
-    cost: float
-    evaluations: int
-    jacobians: int
-
-
-def least_squares_with_scipy(problem: Problem, *, our_jacobian: bool) -> Callable[[], Descent]:
-    """SciPy's `least_squares` from the space's start, with our Jacobian or finite differences.
-
-    The residuals are ours and compiled in both cases. It stops at our solver's tolerance.
-    """
-    start = np.asarray(problem.space.start, float)
-    residuals = jax.jit(lambda problem, u: problem.residuals(u))
-    jacobian = jax.jit(lambda problem, u: problem.jacobian(u))
-
-    def residuals_at(u: np.ndarray) -> np.ndarray:
-        return np.asarray(residuals(problem, jnp.asarray(u)))
-
-    def jacobian_at(u: np.ndarray) -> np.ndarray:
-        return np.asarray(jacobian(problem, jnp.asarray(u)))
-
-    def descend() -> Descent:
-        scheme = jacobian_at if our_jacobian else "2-point"
-        end = least_squares(residuals_at, start, jac=scheme, ftol=1e-6)  # pyright: ignore
-        return Descent(float(end.cost), int(end.nfev), int(end.njev))
-
-    return descend
-
-
 def _inputs(batch: workloads.LegBatch) -> Inputs:
     """What `pose` reads. It needs no terrain, so that any will do."""
     return Inputs(batch.rig, plane(), batch.frame, jaxik.HARD)
@@ -213,26 +172,11 @@ def _split_over_cores(
     axis: int = -1,
     sparse: PyTree = (),
 ) -> Call:
-    """A call, named "ours", in which each core computes its part of the items with one program.
-
-    Items are arrays, counted along `axis`; a run reads little of those that are `sparse`.
-    """
-    count = jax.tree.leaves(items)[0].shape[axis]
-    size = -(-count // usable_cores())
-    structure = jax.tree.structure((shared, items))
-
-    def part_from(first: int) -> list[jax.Array]:
-        first = min(first, count - size)  # the last part overlaps, to be of the same size
-        cut = functools.partial(jax.lax.slice_in_dim, axis=axis)
-        part = jax.tree.map(lambda leaf: cut(leaf, first, first + size), items)
-        return jax.tree.leaves((shared, part))
-
-    def of_part(leaves: list) -> PyTree:
-        return function(*jax.tree.unflatten(structure, leaves))
-
-    # Flattened beforehand: while Python flattens arguments, no other thread can start.
-    parts = [(part_from(first),) for first in range(0, count, size)]
-    return measurement.compile_parts("ours", of_part, parts, sparse)
+    """A call, named "ours", in which each core computes its part of the items."""
+    size = -(-jax.tree.leaves(items)[0].shape[axis] // usable_cores())
+    return measurement.compile_parts(
+        "ours", function, shared, items, size, axis=axis, sparse=sparse
+    )
 
 
 def _add_time_per_leg(measurement: Measurement, count: int, at_most: float) -> None:
@@ -256,16 +200,16 @@ def legs(measurement: Measurement, sizes: Sizes) -> None:
     measurement.add_timing("NumPy", "NumPy, a leg", "ns", items=batch.count)
 
 
-def numpy_arguments(batch: workloads.LegBatch) -> tuple[Legs, KneeLimits]:
+def numpy_arguments(batch: workloads.LegBatch) -> tuple[Legs, float, float, float]:
     """A batch of legs, and the limits of its knees, as arguments of `two_bone`."""
     rule = batch.ik.leg
     assert isinstance(rule, TwoBone)
-    limits = KneeLimits(float(rule.min_knee_angle), float(rule.max_knee_angle), float(rule.soften))
+    limits = rule.min_knee_angle, rule.max_knee_angle, rule.soften
     pose = batch.frame.pose
     axis = jnp.broadcast_to(batch.rig.knee_axis_ls, pose.hip.pos.shape)
     arrays = (pose.hip.pos, pose.knee.pos, pose.ankle.pos, pose.hip.rot, pose.knee.rot, axis)
     flat = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (*arrays, batch.target_ms))
-    return Legs(*flat), limits
+    return Legs(*flat), *map(float, limits)
 
 
 def feet(measurement: Measurement, sizes: Sizes) -> None:
@@ -283,7 +227,7 @@ def rays(measurement: Measurement, sizes: Sizes) -> None:
     ground = jax.block_until_ready(workloads.ground(mesh))
     seconds = time.perf_counter() - start
     note = "with the small programs that its shape needs"
-    measurement.add(Figure("build the grid", seconds, "s", note=note))
+    measurement.add("build the grid", seconds, "s", note=note)
     origins = workloads.ray_origins(sizes.rays)
     starts = jnp.asarray(origins)
     ours = _split_over_cores(measurement, cast_down, ground, starts, axis=0, sparse=ground)
@@ -438,8 +382,6 @@ def start(measurement: Measurement, sizes: Sizes) -> None:
             for times in (measurement.samples, measurement.busy)
         )
         measurement.add(
-            Figure(
-                what, float(np.median(seconds)), "s", target,
-                spread=(min(seconds), max(seconds)), busy=float(np.median(cpu_seconds)),
-            )
+            what, float(np.median(seconds)), "s", at_most=target,
+            spread=(min(seconds), max(seconds)), busy=float(np.median(cpu_seconds)),
         )  # fmt: skip

@@ -5,7 +5,6 @@ Programs are compiled ahead of time, and compiling is timed separately. Calls th
 in turns, in random order, so that other load on the machine affects all of them.
 """
 
-import dataclasses
 import functools
 import json
 import math
@@ -90,8 +89,14 @@ class Series:
 
     size: str
     """Its name."""
-    sizes: list[int]
-    seconds: dict[str, list[float]]
+    sizes: list[int] = field(default_factory=list)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, size: int, seconds: Mapping[str, float]) -> None:
+        """Adds a point to each curve."""
+        self.sizes.append(size)
+        for name, value in seconds.items():
+            self.seconds.setdefault(name, []).append(value)
 
     def slope(self, name: str, last: int = 0) -> float:
         """Exponent of the power law of a curve: 1 where twice the size takes twice the time.
@@ -156,13 +161,43 @@ class Measurement:
         return lambda: jax.block_until_ready(program(*arguments))
 
     def compile_parts(
-        self, name: str, function: Callable, parts: Sequence[tuple], sparse: PyTree = ()
+        self,
+        name: str,
+        function: Callable,
+        shared: PyTree,
+        items: PyTree,
+        size: int,
+        *,
+        axis: int = 0,
+        sparse: PyTree = (),
     ) -> Callable[[], list[PyTree]]:
-        """A call that computes parts of one shape on all cores, by one program."""
-        program = self.compile(name, function, *parts[0], sparse=sparse)
+        """A call that computes items part by part on all cores, by one program for all parts.
+
+        Args:
+            name: of the call.
+            function: of `shared` and a part of `items`.
+            shared: what every part needs.
+            items: arrays, counted along `axis`.
+            size: of a part; the last one overlaps the one before.
+            axis: of the items.
+            sparse: see `compile`.
+        """
+        count = jax.tree.leaves(items)[0].shape[axis]
+        structure = jax.tree.structure((shared, items))
+
+        def leaves_from(first: int) -> list[jax.Array]:
+            ends = first, first + size
+            part = jax.tree.map(lambda x: jax.lax.slice_in_dim(x, *ends, axis=axis), items)
+            return jax.tree.leaves((shared, part))
+
+        def of_leaves(leaves: list) -> PyTree:
+            return function(*jax.tree.unflatten(structure, leaves))
+
+        # Flattened beforehand: while Python flattens arguments, no other thread can start.
+        parts = [leaves_from(min(first, count - size)) for first in range(0, count, size)]
+        program = self.compile(name, of_leaves, parts[0], sparse=sparse)
         self.work[name] = self.work[name] * len(parts)
-        calls = [functools.partial(program, *part) for part in parts]
-        return functools.partial(on_all_cores, calls)
+        return functools.partial(on_all_cores, [functools.partial(program, p) for p in parts])
 
     def time_in_turns(
         self, calls: Mapping[str, Call], repeats: int = 0, *, warm_up: bool = True
@@ -191,9 +226,9 @@ class Measurement:
         self.busy |= busy
         return medians(samples)
 
-    def add(self, figure: Figure) -> None:
-        """Adds a figure."""
-        self.figures.append(figure)
+    def add(self, what: str, value: float, unit: str, **rest: Any) -> None:
+        """Adds a figure; `rest` are further fields of it."""
+        self.figures.append(Figure(what, value, unit, **rest))
 
     def add_timing(
         self,
@@ -232,7 +267,7 @@ class Measurement:
             seconds, rest["bound"] = lower_bound(work, self.ceilings, floats or self.floats)
             rest["limit"] = figure(seconds)
         spread = min(values), max(values)
-        self.add(Figure(what, statistics.median(values), unit, spread=spread, **rest))
+        self.add(what, statistics.median(values), unit, spread=spread, **rest)
 
     def add_ratio(self, slow: str, fast: str, what: str, **rest: Any) -> None:
         """Adds how many times as long one call takes as another, as the ratio of the medians.
@@ -241,7 +276,7 @@ class Measurement:
         """
         ratios = [a / b for a, b in zip(self.samples[slow], self.samples[fast], strict=True)]
         median = statistics.median(self.samples[slow]) / statistics.median(self.samples[fast])
-        self.add(Figure(what, median, "times", spread=(min(ratios), max(ratios)), **rest))
+        self.add(what, median, "times", spread=(min(ratios), max(ratios)), **rest)
 
 
 def medians(samples: Mapping[str, Sequence[float]]) -> dict[str, float]:
@@ -322,7 +357,7 @@ def peak_memory_mb() -> float:
     return machine.peak_mb() or float("nan")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Benchmark:
     """Something to be measured, and how."""
 
@@ -336,12 +371,12 @@ class Benchmark:
     """Left out of a quick run, unless it is named."""
 
 
-@dataclasses.dataclass
+@dataclass
 class Report:
     """All that was measured."""
 
     quick: bool
-    measurements: list[Measurement] = dataclasses.field(default_factory=list)
+    measurements: list[Measurement] = field(default_factory=list)
     interrupted: bool = False
 
 

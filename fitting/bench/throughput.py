@@ -40,7 +40,6 @@ from jaxik.world.terrain import Terrain, plane
 from . import fits, kernels, workloads
 from .measurement import (
     Call,
-    Figure,
     Measurement,
     Series,
     call_in_process,
@@ -102,8 +101,7 @@ def _vary(
     What is left out, and why, is a note: more than `most`, which would share the same cores, and
     whatever is larger than a point that took long or failed.
     """
-    series = Series(what, [], {})
-    measurement.series.append(series)
+    measurement.series.append(series := Series(what))
     result = ""
     for index, count in enumerate(counts):
         if count > most:
@@ -118,12 +116,12 @@ def _vary(
             measurement.failures.append(f"{count} {what}: {last or error}")
             _leave_out(measurement, what, counts[index + 1 :], f"{count} failed")
             return
-        series.sizes.append(count)
+        seconds = {"": point["seconds"], ": CPU time": point["cpu_seconds"]}
+        series.add(count, {f"{curve}{name}": value for name, value in seconds.items()})
         label = f"{curve}, {count} {what}"
-        for name, key in (("", "seconds"), (": CPU time", "cpu_seconds")):
-            series.seconds.setdefault(f"{curve}{name}", []).append(point[key])
-            measurement.add(Figure(f"{label}{name}", point[key], "s"))
-        measurement.add(Figure(f"{label}: peak of memory", point["peak_mb"], "MB"))
+        for name, value in seconds.items():
+            measurement.add(f"{label}{name}", value, "s")
+        measurement.add(f"{label}: peak of memory", point["peak_mb"], "MB")
         result = f"; {count}: {point['seconds']:.2g} s"
         if (took := time.monotonic() - began) > LONGEST:
             _leave_out(measurement, what, counts[index + 1 :], f"{count} took {took:.0f} s")
@@ -143,13 +141,9 @@ def _measured(what: str, count: int) -> Mapping[str, float]:
     """
     variables = {"JAX_ENABLE_X64": "1"}
     if what == "devices":
-        variables["XLA_FLAGS"] = _flags(count)
+        flags = f"{os.environ.get('XLA_FLAGS', '')} {SIMULATED.format(count)}"
+        variables["XLA_FLAGS"] = flags.strip()
     return call_in_process(measure_point, what, count, environment=os.environ | variables)
-
-
-def _flags(devices: int) -> str:
-    """The flags of this process with simulated devices."""
-    return f"{os.environ.get('XLA_FLAGS', '')} {SIMULATED.format(devices)}".strip()
 
 
 def of_devices(count: int) -> dict[str, float]:
@@ -197,11 +191,8 @@ def _second_time(call: Callable[[], object]) -> dict[str, float]:
     watch = Stopwatch()
     call()
     effort = watch.read()
-    return {
-        "seconds": effort["seconds"],
-        "cpu_seconds": effort["cpu_seconds"],
-        "peak_mb": effort["peak_mb"] or float("nan"),
-    }
+    peak = effort["peak_mb"] or float("nan")
+    return {**{key: effort[key] for key in ("seconds", "cpu_seconds")}, "peak_mb": peak}
 
 
 POINTS = {"devices": of_devices, "clips": of_clips, "workers": of_workers}
@@ -249,22 +240,14 @@ def in_chunks(
     All chunks use one program, of a crowd, a ground and one member: its workspace, times the cores,
     is what a crowd of any size needs.
     """
-    count = crowd.first.size
-    chunk = min(chunk, count)
-    # The last chunk overlaps the one before, so that all have one shape.
-    starts = [min(first, count - chunk) for first in range(0, count, chunk)]
-    shared = dataclasses.replace(
-        crowd, drawn={}, place_ws=crowd.place_ws[:0], first=crowd.first[:0]
-    )
-    parts = [
-        (shared, ground, jax.tree.map(lambda leaf: leaf[first : first + chunk], crowd.members))  # noqa: B023
-        for first in starts
-    ]
 
-    def of_chunk(shared: Crowd, ground: Terrain, members: Member) -> PyTree:
-        return jaxik.lanes(lambda member: function(shared, ground, member), out_axes=-1)(members)
+    def of_chunk(shared: tuple[Crowd, Terrain], members: Member) -> PyTree:
+        return jaxik.lanes(lambda member: function(*shared, member), out_axes=-1)(members)
 
-    return measurement.compile_parts(name, of_chunk, parts, ground)
+    members = crowd.members
+    shared = dataclasses.replace(crowd, members=jax.tree.map(lambda leaf: leaf[:0], members))
+    size = min(chunk, crowd.members.first.size)
+    return measurement.compile_parts(name, of_chunk, (shared, ground), members, size, sparse=ground)
 
 
 def crowd(measurement: Measurement, sizes: Sizes) -> None:
@@ -284,7 +267,7 @@ def crowd(measurement: Measurement, sizes: Sizes) -> None:
         what, at_least = f"{name}, leg-frames a second", target / time_in_width()
         _add_leg_frames(measurement, name, what, count, at_least=at_least)
     note = "all results of the crowd are kept"
-    measurement.add(Figure("peak of memory", peak, "MB", note=note))
+    measurement.add("peak of memory", peak, "MB", note=note)
 
 
 def gradient(measurement: Measurement, sizes: Sizes) -> None:
@@ -303,7 +286,7 @@ def gradient(measurement: Measurement, sizes: Sizes) -> None:
     note = f"{sizes.derived} characters; by operations {operations:.1f} times"
     measurement.add_ratio("reverse", "forward", "reverse in forward runs", at_most=4.0, note=note)
     _add_leg_frames(measurement, "reverse", "leg-frames a second", count)
-    measurement.add(Figure("peak of memory", peak, "MB"))
+    measurement.add("peak of memory", peak, "MB")
 
 
 def _add_leg_frames(
@@ -373,19 +356,15 @@ def _varied_by_core(
     measurement: Measurement, size: str, values: Iterable[int], measure: Callable[[int], Point]
 ) -> None:
     """Adds a series, point by point, so that measured points survive an interrupt."""
-    series = Series(size, [], {})
-    measurement.series.append(series)
+    measurement.series.append(series := Series(size))
     for value in values:
-        point = measure(value)
-        series.sizes.append(value)
-        for name, seconds in point.items():
-            series.seconds.setdefault(name, []).append(seconds)
+        series.add(value, measure(value))
     for name, seconds in series.seconds.items():
         if len(seconds) > 1:
             tail = min(TAIL, len(seconds))
             note = f"{series.slope(name, TAIL):.2f} over the {tail} largest"
             what = f"{name} against {size}"
-            measurement.add(Figure(what, series.slope(name), "slope", note=note))
+            measurement.add(what, series.slope(name), "slope", note=note)
 
 
 def _median(measurement: Measurement, name: str, call: Call) -> float:

@@ -205,15 +205,12 @@ class Crowd(eqx.Module):
     """Characters with different parameters, places and starting frames, in one shared clip."""
 
     ik: jaxik.FootIK
-    """Shared, except for the parameters in `drawn`."""
+    """Shared, except for the parameters that members have drawn."""
     rig: jaxik.Rig
     motion: jaxik.Frame
     """Twice as long as each character needs."""
-    drawn: dict[str, Float[Array, " characters"]]
-    place_ws: Float[Array, "characters 3"]
-    """m, of the first frame."""
-    first: Int[Array, " characters"]
-    """Frame of `motion` with which each starts."""
+    members: Member
+    """All characters, on the first axis."""
     frame_count: int = eqx.field(static=True)
     """Of each."""
 
@@ -229,11 +226,6 @@ class Crowd(eqx.Module):
             lambda frame: frame.world_from_model.pos, frames, moved
         )
 
-    @property
-    def members(self) -> Member:
-        """All characters, on the first axis."""
-        return Member(self.drawn, self.place_ws, self.first)
-
 
 def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
     """Characters that walk on the mesh field for so many frames each."""
@@ -248,9 +240,11 @@ def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
         single(jaxik.presets.record(faithful=True)),
         single(clip.rig),
         single(clip_frames.frames_from_clip(clip)),
-        single(drawn),
-        jnp.asarray(place, jnp.float32),
-        jnp.asarray(random.integers(0, frame_count, characters), jnp.int32),
+        Member(
+            single(drawn),
+            jnp.asarray(place, jnp.float32),
+            jnp.asarray(random.integers(0, frame_count, characters), jnp.int32),
+        ),
         frame_count,
     )
 

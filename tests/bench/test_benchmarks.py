@@ -152,11 +152,11 @@ def trivial_suite(monkeypatch):
     def quick(timings: Measurement, sizes: Sizes) -> None:
         timings.time_in_turns({"ours": lambda: None, "theirs": lambda: None})
         timings.add_timing("ours", "ours", at_most=1.0)
-        timings.add(Figure("a ratio", 2.0, "times", at_least=3.0, note="of nothing"))
+        timings.add("a ratio", 2.0, "times", at_least=3.0, note="of nothing")
         timings.series.append(Series("size", [1, 10], {"ours": [1.0, 10.0]}))
 
     def stopped(timings: Measurement, sizes: Sizes) -> None:
-        timings.add(Figure("before", 1.0, "s"))
+        timings.add("before", 1.0, "s")
         raise KeyboardInterrupt
 
     child = measurement.subprocess.CalledProcessError(
@@ -201,7 +201,7 @@ def test_the_command_prints_a_table_with_the_hardware_and_its_json_is_complete(
     assert row["medians"] == {name: np.median(each) for name, each in samples.items()}
     assert row["series"][0]["slopes"] == {"ours": pytest.approx(1.0)}
     timings = Measurement("x", "x", 1, load=np.nan)  # what is not finite is null
-    timings.add(Figure("memory", np.nan, "MB", limit=np.inf))
+    timings.add("memory", np.nan, "MB", limit=np.inf)
     (row,) = json.loads(report.to_json(measurement.Report(False, [timings])))["rows"]
     assert row["figures"][0]["value"] is row["figures"][0]["limit"] is row["load"] is None
 
