@@ -29,7 +29,7 @@ from .clip import (
 from .guesses import with_balls
 from .joint_maps import ADVICE, Leg, Roles, find_roles
 from .rigs import left_directions, measure_rig, relative_size, stiff_knees
-from .skating import TRAVELS, Feet
+from .skating import Feet
 
 NO_LEGS = "no legs are recognised"
 UP_ADVICE = "give --up (up=... in Python) if you know better"
@@ -39,33 +39,15 @@ RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 
 RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
 
 
-@dataclass(frozen=True)
-class Overrides:
-    """What the caller knows better than the file; None leaves it to be read or guessed."""
-
-    scale: float | None = None
-    """Metres per unit of the file."""
-    fps: float | None = None
-    """Frames per second."""
-    up: str | None = None
-    """Either "y" or "z"."""
-    joints: Mapping[str, str] | None = None
-    """Role to joint name, see `joint_maps.find_roles`."""
-    travel: str | None = None
-    """Whether the root travels as standing feet show: one of `TRAVELS`; None is "auto"."""
-
-    def __post_init__(self) -> None:
-        if self.up not in (None, "y", "z"):
-            raise ValueError(f"up is {self.up!r}; wanted 'y' or 'z'")
-        if self.travel not in (None, *TRAVELS):
-            raise ValueError(f"travel is {self.travel!r}; wanted one of {', '.join(TRAVELS)}")
-        for name, value in (("scale", self.scale), ("fps", self.fps)):
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}; wanted a number above 0")
-
-
 def clip_from_recording(
-    recording: Recording, source: str, overrides: Overrides = Overrides()
+    recording: Recording,
+    source: str,
+    *,
+    scale: float | None = None,
+    fps: float | None = None,
+    up: str | None = None,
+    joints: Mapping[str, str] | None = None,
+    travel: str | None = None,
 ) -> Clip:
     """The recording in metres with y up, with its legs recognised and measured.
 
@@ -74,32 +56,35 @@ def clip_from_recording(
     Args:
         recording: the contents of a motion file.
         source: the file's name, for messages.
-        overrides: what must not be guessed.
+        scale: metres per unit of the file; None takes the file's, or guesses it.
+        fps: frames per second; None takes the common rate nearest to the file's.
+        up: "y" or "z"; None takes the file's, or guesses it.
+        joints: role to joint name, see `joint_maps.find_roles`; None recognises the names.
+        travel: whether the root travels as standing feet show: one of `TRAVELS`; None is "auto".
 
     Raises:
-        ValueError: `overrides.joints` names joints that do not exist, or a joint, a leg or the
+        ValueError: `joints` names joints that do not exist, or a joint, a leg or the
             frame rate is beyond what a body can be.
     """
     _check_places(recording, source, HUGE, "units of the file")
     remarks = list(recording.remarks)
     roles: Roles | None = None
     try:
-        roles = find_roles(recording.names, recording.parents, overrides.joints)
+        roles = find_roles(recording.names, recording.parents, joints)
     except ValueError as error:
-        if overrides.joints is not None:
+        if joints is not None:
             raise ValueError(f"{source}: {error}") from None
         remarks.append(f"{_first_clause(error)}; {ADVICE}")
-    scale = overrides.scale
     if scale is None:
         scale = _find_scale(recording, roles, remarks)
     recording = recording.scaled(scale)
     _check_places(recording, source, FURTHEST, f"m, at {scale:g} m per unit (scale=...)")
     if roles is not None:
         roles = _with_bones(recording, source, roles, scale, remarks)
-    up = overrides.up or recording.up_axis or _guess_up(recording, roles, remarks)
+    up = up or recording.up_axis or _guess_up(recording, roles, remarks)
     if up == "z":
         recording = recording.rotated(Y_UP_FROM_Z_UP)
-    rate = overrides.fps or common_rate(recording.frame_time, remarks)
+    rate = fps or common_rate(recording.frame_time, remarks)
     if not SLOWEST <= rate <= FASTEST:
         raise ValueError(
             f"{source}: {rate:.4g} frames per second; wanted {SLOWEST:g} to {FASTEST:g}; "
@@ -116,9 +101,9 @@ def clip_from_recording(
         feet = skating.measure(_feet(roles, positions_ws, rotations_ws, rate))
         stance = feet.stance
         with error_context(source):
-            if feet.moves_root(overrides.travel):
+            if feet.moves_root(travel):
                 positions_ws = positions_ws + feet.travel_ws[:, None]
-        remarks += feet.remarks(overrides.travel)
+        remarks += feet.remarks(travel)
         if (known := recording.mask) is not None:  # nothing is measured on a guess
             seen_ws, turned_ws, stance = positions_ws[known], rotations_ws[known], stance[known]
         else:

@@ -1,15 +1,17 @@
 """`load_clip`: opens a motion file with the reader that its suffix selects."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from fitting.runtime.declarations import key, keys
 from fitting.runtime.validation import check_file
 
 from . import edit, formats
-from .assemble import Overrides, clip_from_recording
+from .assemble import clip_from_recording
 from .clip import Clip, Recording
 from .formats.asfamc import read_asfamc
 from .formats.c3d import draft_marker_map, joint_name, read_c3d
@@ -17,7 +19,7 @@ from .formats.gltf import SUFFIXES as GLTF
 from .formats.gltf import read_gltf
 from .formats.npz import read_npz
 from .joint_maps import read_joint_map, template
-from .skating import Travel
+from .skating import TRAVELS, Travel
 
 JointMap = Mapping[str, str] | str | Path
 """Role to joint name, see `joint_maps.find_roles`; or a file that `clips.joint_maps` reads."""
@@ -134,19 +136,38 @@ def load_clip(
     _check_arguments(path, asf, animation)
     if isinstance(joints, str | Path):
         joints = read_joint_map(Path(joints))
-    overrides = Overrides(scale, fps, up, joints, travel)
+    _check_values(scale, fps, up, travel)
+    stated: dict[str, Any] = {
+        "scale": scale,
+        "fps": fps,
+        "up": up,
+        "joints": joints,
+        "travel": travel,
+    }
     if suffix == ".npz":
-        arguments = {**vars(overrides), "animation": animation}
+        arguments = {**stated, "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
         return edit.on_floor(read_npz(path), 0.0, sole)
     if suffix == ".c3d":
         recording = read_c3d(path, joints, scale)
         if joints is not None:  # which named markers
-            overrides = replace(overrides, joints={role: joint_name(role) for role in joints})
+            stated["joints"] = {role: joint_name(role) for role in joints}
     else:
         recording = _read(path, asf, animation, fps)
-    return edit.on_floor(clip_from_recording(recording, path.name, overrides), 0.0, sole)
+    return edit.on_floor(clip_from_recording(recording, path.name, **stated), 0.0, sole)
+
+
+def _check_values(
+    scale: float | None, fps: float | None, up: str | None, travel: str | None
+) -> None:
+    if up not in (None, "y", "z"):
+        raise ValueError(f"up is {up!r}; wanted 'y' or 'z'")
+    if travel not in (None, *TRAVELS):
+        raise ValueError(f"travel is {travel!r}; wanted one of {', '.join(TRAVELS)}")
+    for name, value in (("scale", scale), ("fps", fps)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}; wanted a number above 0")
 
 
 def _check_arguments(path: Path, asf: str | Path | None, animation: str | None) -> None:
