@@ -1,7 +1,7 @@
 """Summary of a clip: what the loader understood of a file, as data, text or JSON."""
 
 import json
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -9,58 +9,19 @@ from . import contacts, edit
 from .clip import Clip
 from .joint_maps import LEG_ROLES
 
-
-class LegSummary(TypedDict):
-    """One leg; lengths in metres."""
-
-    side: float
-    """1 left, -1 right, 0 neither."""
-    thigh: float
-    shin: float
-    foot: float
-    ankle_height: float
-    """Over the sole."""
-    ball_height: float
-    """Likewise."""
-    knee_axis: list[float]
-    """Unit, knee space."""
-    ankle_from_foot: list[float]
-    """Unit quaternions, wxyz."""
-    contacts: int
-    """Number of stances of which a frame was observed."""
-    contact_share: float
-    """0..1, of the observed frames."""
-    contacts_from: str
-    """File or motion."""
+Summary = dict[str, Any]
 
 
-class ClipSummary(TypedDict):
-    """A clip; lengths in metres."""
+def describe(clip: Clip) -> Summary:
+    """What is known of a clip, including guesses and defects, as plain data.
 
-    file: str
-    frames: int
-    observed_frames: int
-    """Those that are not masked."""
-    seconds: float
-    fps: float
-    raw_frame_time: float
-    """Seconds."""
-    raw_fps: float
-    scale: float
-    """Metres per unit of the file."""
-    up_axis: str
-    body_height: float
-    joints: list[str]
-    dialect: str | None
-    """Joint naming convention."""
-    joint_map: dict[str, str]
-    """Role to joint name."""
-    legs: dict[str, LegSummary]
-    warnings: list[str]
-
-
-def describe(clip: Clip) -> ClipSummary:
-    """What is known of a clip, including guesses and defects, as plain data."""
+    Lengths are metres, and heights of a leg are over its sole. `scale` is metres per unit of the
+    file, `observed_frames` are those that are not masked, `joint_map` gives joint names by role.
+    Among the `legs`, `side` is 1 left, -1 right and 0 neither, `knee_axis` a unit vector in knee
+    space, `ankle_from_foot` a unit quaternion, wxyz, `contacts` the number of stances of which a
+    frame was observed, `contact_share` their fraction of the observed frames, and `contacts_from`
+    either "file" or "motion".
+    """
     warnings = list(clip.remarks)
     (first, last), (start, end) = edit.motion_span(clip), edit.observed_span(clip)
     if first > start:
@@ -97,7 +58,7 @@ def _joint_map(clip: Clip) -> dict[str, str]:
     return joint_map
 
 
-def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
+def _describe_legs(clip: Clip) -> Summary:
     rig, stance = clip.rig, clip.observed_stances()
     share = stance[clip.observed].sum(axis=0) / max(clip.observed.sum(), 1)
     return {
@@ -118,7 +79,7 @@ def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
     }
 
 
-def contact_text(summary: ClipSummary, leg: LegSummary) -> str:
+def contact_text(summary: Summary, leg: Summary) -> str:
     """How often and how long a foot stands."""
     observed = summary["observed_frames"]
     frames = "frames" if observed == summary["frames"] else f"{observed} observed frames"
@@ -128,7 +89,7 @@ def contact_text(summary: ClipSummary, leg: LegSummary) -> str:
     )
 
 
-def rows(summary: ClipSummary) -> list[list[str]]:
+def rows(summary: Summary) -> list[list[str]]:
     """A heading of one cell, and below it rows of a subject, which may be empty, and its text."""
     joints, joint_map = summary["joints"], summary["joint_map"]
     lines = [
@@ -166,12 +127,12 @@ def rows(summary: ClipSummary) -> list[list[str]]:
     return lines + [["note", warning] for warning in summary["warnings"]]
 
 
-def as_text(summary: ClipSummary) -> str:
+def as_text(summary: Summary) -> str:
     """The summary as text for a pipe."""
     (heading,), *rest = rows(summary)
     return "\n".join([heading, *(f"  {subject:<7} {text}" for subject, text in rest)])
 
 
-def as_json(summary: ClipSummary) -> str:
+def as_json(summary: Summary) -> str:
     """The summary as JSON."""
     return json.dumps(summary, indent=2)
