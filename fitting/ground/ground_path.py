@@ -1,4 +1,4 @@
-"""The ground along a character's path, and where to put its root over it.
+"""The ground along a character's path: where to put its root, and a patch of it for pictures.
 
 A flat animation keeps its root on its own floor. On a hill or on stairs that is metres away from
 the ground, further than foot IK reaches. The root then follows the ground below it, smoothed over a
@@ -12,8 +12,9 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Float64
+from jaxtyping import Array, ArrayLike, Bool, Float, Float64
 from scipy.ndimage import convolve1d
+from scipy.spatial import KDTree
 
 from fitting.clips import contacts
 from fitting.clips.clip import Clip
@@ -33,6 +34,12 @@ SKY = HORIZON / 2  # m, above all ground
 RAYS = 1024  # that are cast in one call
 MISSING = "there is no ground below most of its path"
 USUAL_STRIDE = 1.05  # s, where a clip shows none
+
+MARGIN = 1.5  # m around the path of a patch, for an adult
+FINEST = 0.025  # m between heights, for an adult
+MAX_HEIGHTS = 40_000  # within the margin
+MAX_CELLS = 200_000  # of the grid, which also covers what is further away
+HEADROOM = 0.3  # m above the highest joint, where rays start: below a ceiling
 
 
 @dataclass(frozen=True)
@@ -213,3 +220,51 @@ def _ground_under_stances(
 
 def _range(heights: np.ndarray) -> str:
     return f"{100 * heights.min():.0f} to {100 * heights.max():.0f} cm above"
+
+
+@dataclass(frozen=True)
+class GroundPatch:
+    """Heights of the ground on a grid that is aligned with x and z."""
+
+    corner: Float64[np.ndarray, "2"]
+    """x and z of the first height, m."""
+    spacing: float
+    """m, in both directions."""
+    heights: Float64[np.ndarray, "rows columns"]
+    """m; rows follow z, columns x. NaN where there is no ground, and further from the path."""
+
+
+def around_path(clip: Clip, terrain: Terrain) -> GroundPatch:
+    """The ground around the path of a clip's pelvis.
+
+    Rays start a little above the character, so that a roof is not ground.
+
+    Args:
+        clip: y up, of one frame or more.
+        terrain: y up.
+    """
+    size = body.ratio(clip.rig)
+    path = clip.positions_ws[:, clip.rig.pelvis][:, [0, 2]]
+    tops = clip.positions_ws[..., 1].max(axis=1) + HEADROOM * size
+    tree, margin = KDTree(path), MARGIN * size
+    low, high = path.min(axis=0) - margin, path.max(axis=0) + margin
+    extent = high - low
+    spacing = max(FINEST * size, float(np.sqrt(extent[0] * extent[1] / MAX_CELLS)))
+    points, near = _grid(low, high, spacing, tree, margin)
+    if near.sum() > MAX_HEIGHTS:
+        spacing *= float(np.sqrt(near.sum() / MAX_HEIGHTS))
+        points, near = _grid(low, high, spacing, tree, margin)
+    nearest = tree.query(points[near])[1]
+    heights = np.full(points.shape[:2], np.nan)
+    heights[near] = heights_under(terrain, np.insert(points[near], 1, 0.0, axis=1), tops[nearest])
+    return GroundPatch(low, spacing, heights)
+
+
+def _grid(
+    low: np.ndarray, high: np.ndarray, spacing: float, tree: KDTree, margin: float
+) -> tuple[Float64[np.ndarray, "rows columns 2"], Bool[np.ndarray, "rows columns"]]:
+    """Points x, z of a grid, and which of them are near the path."""
+    x, z = (np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True))
+    points = np.stack(np.meshgrid(x, z), axis=-1)
+    distance = tree.query(points, distance_upper_bound=margin)[0]
+    return points, np.isfinite(distance)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from fitting.ground.ground_patch import GroundPatch
+from fitting.ground.ground_path import GroundPatch
 from fitting.motion.measures import PlacedMotion
 from jaxik.world import body
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.clips import flight
-from fitting.ground import ground_patch
+from fitting.ground import ground_path
 from fitting.motion.measures import BOUNDED, MEASURES, Bounded, Measures
 from fitting.report import motion_data
 from fitting.report.document import (
@@ -477,7 +477,7 @@ def shown(comparison: Comparison, systems: tuple[str, ...], watched: str) -> Sho
     return ShownClip(
         motions,
         comparison.animated.clip.stance_labels(),
-        ground_patch.around_path(highest, comparison.animation.terrain),
+        ground_path.around_path(highest, comparison.animation.terrain),
         watched=key(watched if watched in comparison.motions else ANIMATED),
     )
 

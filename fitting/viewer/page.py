@@ -19,8 +19,8 @@ from scipy.ndimage import uniform_filter1d
 from websockets.asyncio import server as asyncio_server
 
 import jaxik
-from fitting.ground import ground_patch
-from fitting.ground.ground_patch import GroundPatch
+from fitting.ground import ground_path
+from fitting.ground.ground_path import GroundPatch
 from fitting.ground.meshes import grid_faces
 from fitting.report.formatting import figures_table, markdown, transposed
 from fitting.runtime.precision import in_float64
@@ -238,7 +238,7 @@ class Figure:
         server.initial_camera.look_at = np.zeros(3)
         server.initial_camera.position = VIEW_FROM * body.ratio(clip.rig)
         server.initial_camera.up = (0.0, 1.0, 0.0)
-        self._add_ground(ground_patch.around_path(clip, solver.animation.terrain))
+        self._add_ground(ground_path.around_path(clip, solver.animation.terrain))
         self._put_motion("before", solver.before)
         if solver.captured is not None:
             self._put_motion("captured", solver.captured)

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy import stats
 
 from fitting.clips import load_clip
-from fitting.ground import ground_patch
+from fitting.ground import ground_path
 from fitting.motion import worst_window
 from fitting.motion.accuracy import ACCURACY, QUANTITIES
 from fitting.motion.measures import BOUNDED, MEASURES, Cause, Extreme, Measures
@@ -348,7 +348,7 @@ def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, 
 def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
     (clip,) = page.data["clips"]
     ground, (data,) = clip["ground"], fitted.clips
-    patch = ground_patch.around_path(data.reference, data.terrain)
+    patch = ground_path.around_path(data.reference, data.terrain)
     steps = array(ground["heights"], "<u2").reshape(ground["rows"], ground["columns"])
     known = steps != motion_data.HOLE
     heights = ground["low"] + ground["quantum"] * steps
@@ -383,7 +383,7 @@ def test_a_long_clip_has_fewer_frames_and_many_grounds_are_coarser(fitted, motio
     marks = [array(skeleton["inGround"], "u1").any() for _, skeleton in (few, every)]
     assert marks[0] == marks[1]  # what happens between two frames is kept
     heights = np.arange(60_000.0).reshape(200, 300)
-    patch = ground_patch.GroundPatch(np.zeros(2), 0.1, heights)
+    patch = ground_path.GroundPatch(np.zeros(2), 0.1, heights)
     (alone,) = motion_data.coarse_grounds([patch])
     assert alone.heights.shape == heights.shape and alone.spacing == patch.spacing
     coarse = motion_data.coarse_grounds([patch] * 40)

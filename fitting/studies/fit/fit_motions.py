@@ -20,8 +20,8 @@ import jaxik
 from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result, raised
 from fitting.experiment.problems import ClipData
-from fitting.ground import ground_patch
-from fitting.ground.ground_patch import GroundPatch
+from fitting.ground import ground_path
+from fitting.ground.ground_path import GroundPatch
 from fitting.motion import accuracy, playback
 from fitting.motion.accuracy import Accuracy, Errors
 from fitting.motion.measures import PlacedMotion, place, with_soles_of
@@ -69,7 +69,7 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     return ClipMotions(
         **placed,
         stance=data.reference.stance_labels(),
-        ground=ground_patch.around_path(data.reference, data.terrain),
+        ground=ground_path.around_path(data.reference, data.terrain),
         errors={
             name: accuracy.clip_errors(clip, data.reference, animated)
             for name, clip in solved.items()
