@@ -28,8 +28,8 @@ from .clip import (
 )
 from .guesses import with_balls
 from .joint_maps import ADVICE, Leg, Roles, find_roles
-from .rigs import left_directions, measure_rig, relative_size, stiff_knees
-from .skating import Feet
+from .rigs import left_directions, measure_rig, relative_size
+from .skating import Skating
 
 NO_LEGS = "no legs are recognised"
 UP_ADVICE = "give --up (up=... in Python) if you know better"
@@ -98,7 +98,7 @@ def clip_from_recording(
     )
     rig = None
     if roles is not None:
-        feet = skating.measure(_feet(roles, positions_ws, rotations_ws, rate))
+        feet = _skating(roles, positions_ws, rotations_ws, rate)
         stance = feet.stance
         with error_context(source):
             if feet.moves_root(travel):
@@ -117,7 +117,7 @@ def clip_from_recording(
             if stance.any() and not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, seen_ws, turned_ws, stance)
-        remarks += _guessed_knees(roles, seen_ws, turned_ws)
+        remarks += rigs.knee_remarks(roles, seen_ws, turned_ws)
         remarks += rigs.remarks(rig, seen_ws, turned_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
@@ -157,7 +157,7 @@ def clip_from_joints(
     positions_ls, _ = local_from_world(motion.parents, motion.positions_ws, rotations_ws)
     roles = find_roles(motion.names, motion.parents, joints)
     rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
-    remarks = _guessed_knees(roles, motion.positions_ws, rotations_ws)
+    remarks = rigs.knee_remarks(roles, motion.positions_ws, rotations_ws)
     remarks += rigs.remarks(rig, motion.positions_ws, rotations_ws, motion.stance)
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
@@ -166,25 +166,16 @@ def clip_from_joints(
     )  # fmt: skip
 
 
-def _feet(roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray, fps: float) -> Feet:
+def _skating(
+    roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray, fps: float
+) -> Skating:
     joints = np.array([leg.joints for leg in roles.legs])
     side = np.array([leg.side for leg in roles.legs])
     left_ws = left_directions(positions_ws[:, joints[:, 0]], side, rotations_ws[:, roles.pelvis])
-    return Feet(
+    return skating.measure(
         positions_ws[:, joints[:, 3]], positions_ws[:, roles.pelvis], left_ws, fps,
         relative_size(positions_ws, [leg.joints for leg in roles.legs]),
     )  # fmt: skip
-
-
-def _guessed_knees(
-    roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray
-) -> tuple[str, ...]:
-    """A remark for each knee whose axis is a guess."""
-    return tuple(
-        f"the {name} knee hardly moves, so its axis is a guess: take a clip in which it bends, or "
-        "do not trust where this knee points"
-        for name in stiff_knees(roles, positions_ws, rotations_ws)
-    )
 
 
 def _check_places(recording: Recording, source: str, furthest: float, unit: str) -> None:

@@ -21,7 +21,7 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 from . import contacts, skating
 from .joint_maps import ADVICE, find_roles
 from .rigs import left_directions
-from .skating import Feet, Skating
+from .skating import Skating
 
 TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields with frames
 
@@ -165,7 +165,7 @@ class Clip:
         """How the standing feet skate, from the motion alone."""
         pelvis_ws = self.positions_ws[:, self.rig.pelvis]
         size = body.ratio(self.rig)
-        return skating.measure(Feet(self.joints_ws(3), pelvis_ws, self.left_ws(), self.fps, size))
+        return skating.measure(self.joints_ws(3), pelvis_ws, self.left_ws(), self.fps, size)
 
     def observed_stances(self) -> Bool[np.ndarray, "frames legs"]:
         """`stance_labels` without the stances of which no frame was observed."""

@@ -335,16 +335,17 @@ def _knee_rotations(leg: LegMotion) -> Vectors:
     return (local.mean().inv() * local).as_rotvec()
 
 
-def stiff_knees(
+def knee_remarks(
     roles: Roles,
     positions_ws: Float64[np.ndarray, "frames joints 3"],
     rotations_ws: Float64[np.ndarray, "frames joints 4"],
 ) -> tuple[str, ...]:
-    """Names of the legs whose knees move too little to show their axes."""
+    """A remark for each knee that moves too little to show its axis."""
     left_ws = np.zeros((len(positions_ws), 3))  # which is not read
     motions = (leg_motion(leg, left_ws, positions_ws, rotations_ws) for leg in roles.legs)
     return tuple(
-        leg.name
+        f"the {leg.name} knee hardly moves, so its axis is a guess: use a clip in which it bends, "
+        "or do not trust where this knee points"
         for leg, motion in zip(roles.legs, motions, strict=True)
         if knee_motion(motion) < KNEE_MOTION
     )

@@ -31,22 +31,6 @@ OPPOSITE = ("back", "back and right", "right", "forward and right")
 
 
 @dataclass(frozen=True)
-class Feet:
-    """What stances and skating are found from; y up."""
-
-    balls_ws: Float64[np.ndarray, "frames legs 3"]
-    """m, of the ball of each foot."""
-    pelvis_ws: Float64[np.ndarray, "frames 3"]
-    """m."""
-    left_ws: Float64[np.ndarray, "frames 3"]
-    """Unit, to the character's left."""
-    fps: float
-    """Frames per second."""
-    size: float = 1.0
-    """Length of the legs relative to an adult's."""
-
-
-@dataclass(frozen=True)
 class Skating:
     """How the standing feet of a clip move over the floor, all alike."""
 
@@ -117,53 +101,67 @@ class Skating:
         )
 
 
-def measure(feet: Feet) -> Skating:
-    """How the standing feet of a clip skate, and when they stand."""
-    still = contacts.detect_stances(feet.balls_ws, feet.fps, feet.size)
-    count = len(feet.balls_ws)
+def measure(
+    balls_ws: Float64[np.ndarray, "frames legs 3"],
+    pelvis_ws: Float64[np.ndarray, "frames 3"],
+    left_ws: Float64[np.ndarray, "frames 3"],
+    fps: float,
+    size: float,
+) -> Skating:
+    """How the standing feet of a clip skate, and when they stand.
+
+    Args:
+        balls_ws: of the feet, m, y up.
+        pelvis_ws: m.
+        left_ws: unit, to the character's left.
+        fps: frames per second.
+        size: length of the legs relative to an adult's.
+    """
+    still = contacts.detect_stances(balls_ws, fps, size)
+    count = len(balls_ws)
     if count < 2:
         return Skating(np.zeros(2), 0.0, False, False, 0.0, still, np.zeros((count, 3)))
-    axes_ws = _axes(feet)
-    balls_ws = contacts.steadied(feet.balls_ws, feet.fps, feet.size)
-    steps_ws = np.diff(balls_ws, axis=0)
-    own = np.einsum("flk,fka->fla", steps_ws, axes_ws[:-1]) * feet.fps
-    heights = balls_ws[:-1, :, 1]
-    low = heights <= np.quantile(heights, 0.05, axis=0) + LOW * feet.size
-    velocity = _common(own[low], contacts.speed_limit(feet.size))
+    axes_ws = _axes(left_ws, fps)
+    steadied_ws = contacts.steadied(balls_ws, fps, size)
+    steps_ws = np.diff(steadied_ws, axis=0)
+    own = np.einsum("flk,fka->fla", steps_ws, axes_ws[:-1]) * fps
+    heights = steadied_ws[:-1, :, 1]
+    low = heights <= np.quantile(heights, 0.05, axis=0) + LOW * size
+    velocity = _common(own[low], contacts.speed_limit(size))
     speed = float(np.linalg.norm(velocity))
-    common_ws = axes_ws[:-1] @ velocity / feet.fps
+    common_ws = axes_ws[:-1] @ velocity / fps
     slack = UNEVEN * speed
-    stance = contacts.detect_stances(
-        feet.balls_ws - _path(common_ws)[:, None], feet.fps, feet.size, slack
-    )
+    stance = contacts.detect_stances(balls_ws - _path(common_ws)[:, None], fps, size, slack)
     deviations = np.linalg.norm(own - velocity, axis=-1)[stance[:-1]]
     spread = float(np.median(deviations)) if len(deviations) else np.inf
-    travel_ws = -_path(_standing_steps(steps_ws, stance, common_ws, BLEND * feet.fps))
-    stance = contacts.detect_stances(feet.balls_ws + travel_ws[:, None], feet.fps, feet.size)
+    travel_ws = -_path(_standing_steps(steps_ws, stance, common_ws, BLEND * fps))
+    stance = contacts.detect_stances(balls_ws + travel_ws[:, None], fps, size)
     is_clear = bool(
-        speed > NOTICED * feet.size**contacts.SPEED_POWER
+        speed > NOTICED * size**contacts.SPEED_POWER
         and spread < STEADY * speed
         and stance.any(axis=0).all()
         and not stance.all(axis=0).any()
         and stance.sum() >= still.sum()
     )
-    root_speed = _root_speed(feet)
+    root_speed = _root_speed(pelvis_ws, fps)
     in_place = is_clear and root_speed < IN_PLACE * speed
     stance = stance if is_clear else still
     return Skating(velocity, spread, is_clear, in_place, root_speed, stance, travel_ws)
 
 
-def _root_speed(feet: Feet) -> float:
+def _root_speed(pelvis_ws: Float64[np.ndarray, "frames 3"], fps: float) -> float:
     """Median speed of the pelvis over the floor, without its sway, m/s."""
-    way_ws = gaussian_filter1d(feet.pelvis_ws, SWING * feet.fps, axis=0, mode="nearest")
+    way_ws = gaussian_filter1d(pelvis_ws, SWING * fps, axis=0, mode="nearest")
     steps = np.linalg.norm(np.diff(way_ws[:, [0, 2]], axis=0), axis=-1)
-    return float(np.median(steps)) * feet.fps
+    return float(np.median(steps)) * fps
 
 
-def _axes(feet: Feet) -> Float64[np.ndarray, "frames 3 2"]:
+def _axes(
+    left_ws: Float64[np.ndarray, "frames 3"], fps: float
+) -> Float64[np.ndarray, "frames 3 2"]:
     """Unit vectors forward and to the left, level and without the swing of the pelvis."""
-    level = feet.left_ws * [1.0, 0.0, 1.0]
-    left_ws = unit(gaussian_filter1d(level, SWING * feet.fps, axis=0, mode="nearest"))
+    level = left_ws * [1.0, 0.0, 1.0]
+    left_ws = unit(gaussian_filter1d(level, SWING * fps, axis=0, mode="nearest"))
     return np.stack([np.cross(left_ws, [0.0, 1.0, 0.0]), left_ws], axis=-1)
 
 
