@@ -20,7 +20,7 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts, skating
 from .joint_maps import ADVICE, find_roles
-from .rigs import left_directions
+from .rigs import left_directions, rotation
 from .skating import Skating
 
 TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields with frames
@@ -213,7 +213,7 @@ class Clip:
         pos = upright.inv().apply(pos * [1.0, 0.0, 1.0] + [0.0, floor, 0.0])
         zero = np.zeros_like(yaw)
         rot = np.stack([np.cos(yaw / 2), zero, np.sin(yaw / 2), zero], axis=-1)
-        root = upright.inv() * Rotation.from_quat(rot, scalar_first=True)
+        root = upright.inv() * rotation(rot)
         return Transform(*jax.device_put((pos, root.as_quat(scalar_first=True))))
 
     def _heading(self, upright: Rotation) -> Float64[np.ndarray, " frames"]:
@@ -303,9 +303,8 @@ class Recording:
         change = Rotation.from_matrix(matrix)
 
         def turned(rotations: np.ndarray) -> np.ndarray:
-            old = Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)
-            new = (change * old * change.inv()).as_quat(scalar_first=True)
-            return new.reshape(rotations.shape)
+            new = change * rotation(rotations) * change.inv()
+            return new.as_quat(scalar_first=True).reshape(rotations.shape)
 
         rest = self.rest_rotations_ls
         return replace(
@@ -333,7 +332,7 @@ def world_from_local(
     positions_ws, rotations_ws = np.empty_like(positions_ls), np.empty_like(rotations_ls)
     world_rotations: list[Rotation] = []
     for joint, parent in enumerate(parents):
-        rot = Rotation.from_quat(rotations_ls[:, joint], scalar_first=True)
+        rot = rotation(rotations_ls[:, joint])
         pos = positions_ls[:, joint]
         if parent >= 0:
             parent_rot = world_rotations[parent]
@@ -351,11 +350,12 @@ def local_from_world(
     positions_ls, rotations_ls = positions_ws.copy(), rotations_ws.copy()
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            parent_from_world = Rotation.from_quat(rotations_ws[:, parent], scalar_first=True).inv()
-            rot = Rotation.from_quat(rotations_ws[:, joint], scalar_first=True)
+            parent_from_world = rotation(rotations_ws[:, parent]).inv()
             offset_ws = positions_ws[:, joint] - positions_ws[:, parent]
             positions_ls[:, joint] = parent_from_world.apply(offset_ws)
-            rotations_ls[:, joint] = (parent_from_world * rot).as_quat(scalar_first=True)
+            rotations_ls[:, joint] = (parent_from_world * rotation(rotations_ws[:, joint])).as_quat(
+                scalar_first=True
+            )
     return positions_ls, continuous(rotations_ls)
 
 

@@ -15,6 +15,7 @@ from . import contacts
 from .clip import Clip, local_from_world
 from .flight import grounded_track
 from .joint_maps import find_trunk
+from .rigs import rotation
 
 Direction = Sequence[float] | np.ndarray
 
@@ -179,7 +180,7 @@ def clip_from_result(
         world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)
         clip = raised(clip, rise, up_ws)
     body, solved = _world_from_model(world, result.body, result.pose)
-    body_rot, body_pos = _rotation(body.rot), np.asarray(body.pos)
+    body_rot, body_pos = rotation(body.rot), np.asarray(body.pos)
 
     positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
     solved_joints = {
@@ -198,20 +199,20 @@ def clip_from_result(
             positions_ws[:, joint], rotations_ws[:, joint] = solved_joints[joint]
         elif parent in on_legs:
             on_legs.add(joint)
-            parent_rot = _rotation(rotations_ws[:, parent])
+            parent_rot = rotation(rotations_ws[:, parent])
             offset_ws = parent_rot.apply(positions_ls[:, joint])
             positions_ws[:, joint] = positions_ws[:, parent] + offset_ws
-            rotations_ws[:, joint] = _wxyz(parent_rot * _rotation(rotations_ls[:, joint]))
+            rotations_ws[:, joint] = _wxyz(parent_rot * rotation(rotations_ls[:, joint]))
         else:
             positions_ws[:, joint] = body_pos + body_rot.apply(positions_ws[:, joint])
-            rotations_ws[:, joint] = _wxyz(body_rot * _rotation(rotations_ws[:, joint]))
+            rotations_ws[:, joint] = _wxyz(body_rot * rotation(rotations_ws[:, joint]))
     trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
     if result.corrections.spine is not None and trunk.spine is not None:
-        upright = _rotation(world.rot)
+        upright = rotation(world.rot)
         turns = {trunk.spine: result.corrections.spine, trunk.head: result.corrections.head}
         for joint, turn_ms in turns.items():
             if joint is not None and turn_ms is not None:
-                turn_ws = upright * _rotation(turn_ms) * upright.inv()
+                turn_ws = upright * rotation(turn_ms) * upright.inv()
                 above = _with_descendants(joint, clip.parents)
                 _turn(turn_ws, positions_ws, rotations_ws, above)
     return clip.with_motion(positions_ws, rotations_ws)
@@ -233,7 +234,7 @@ def _turn(
     pivot = positions_ws[:, joints[0]].copy()
     for joint in joints:
         positions_ws[:, joint] = pivot + turn_ws.apply(positions_ws[:, joint] - pivot)
-        rotations_ws[:, joint] = _wxyz(turn_ws * _rotation(rotations_ws[:, joint]))
+        rotations_ws[:, joint] = _wxyz(turn_ws * rotation(rotations_ws[:, joint]))
 
 
 def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:
@@ -246,9 +247,5 @@ def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:
     return {"pelvis": clip.positions_ws[:, clip.rig.pelvis], **positions}
 
 
-def _rotation(wxyz: Array | np.ndarray) -> Rotation:
-    return Rotation.from_quat(np.asarray(wxyz, np.float64), scalar_first=True)
-
-
-def _wxyz(rotation: Rotation) -> np.ndarray:
-    return rotation.as_quat(scalar_first=True)
+def _wxyz(turn: Rotation) -> np.ndarray:
+    return turn.as_quat(scalar_first=True)

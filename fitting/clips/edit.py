@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from . import contacts, rigs
 from .clip import Clip, local_from_world, world_from_local
-from .rigs import with_sole, with_soles
+from .rigs import rotation, with_sole, with_soles
 
 MARKER_JUMP = 0.02  # m: a second difference at `MARKER_RATE` that no body produces
 MARKER_RATE = 120.0  # Hz
@@ -45,8 +45,8 @@ def resample(clip: Clip, fps: float) -> Clip:
     positions_ls, rotations_ls = local_from_world(
         clip.parents, clip.positions_ws, clip.rotations_ws
     )
-    start = _rotation(rotations_ls[before])
-    step = (start.inv() * _rotation(rotations_ls[after])).as_rotvec()
+    start = rotation(rotations_ls[before])
+    step = (start.inv() * rotation(rotations_ls[after])).as_rotvec()
     step = step.reshape(count, len(clip.parents), 3) * fraction
     between = start * Rotation.from_rotvec(step.reshape(-1, 3))
     rotations_ls = between.as_quat(scalar_first=True).reshape(count, len(clip.parents), 4)
@@ -191,7 +191,3 @@ def mask_marker_jumps(clip: Clip) -> Clip:
     """The clip with frames in which a marker jumps masked, in addition to those masked already."""
     good = ~marker_jumps(clip)
     return replace(clip, mask=clip.observed & good)
-
-
-def _rotation(rotations: np.ndarray) -> Rotation:
-    return Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)

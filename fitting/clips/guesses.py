@@ -11,14 +11,13 @@ leg's length from the ankle, and 0.16 to 0.44 of that distance below it while th
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaxik.world.body import LEG
 
-from . import contacts
+from . import contacts, rigs
 from .clip import INCH, Recording, world_from_local
 from .joint_maps import Roles
-from .rigs import USUAL_FOOT, flat_frames, foot_axes, left_directions, leg_motion, relative_size
+from .rigs import USUAL_FOOT, left_directions, leg_motion, relative_size
 
 UNITS = {
     "metres": 1.0,
@@ -143,13 +142,13 @@ def _ball(recording: Recording, roles: Roles, index: int, fps: float) -> tuple[n
     leg = leg_motion(roles.legs[index], left_ws, positions_ws, rotations_ws)
     size = relative_size(positions_ws, legs)
     stance = contacts.detect_stances(leg.ankle[:, None], fps, size)[:, 0]
-    ankle_from_foot = foot_axes(leg, flat_frames(leg.ankle, leg.ankle, stance))
+    ankle_from_foot = rigs.foot_axes(leg, rigs.flat_frames(leg.ankle, leg.ankle, stance))
     bones = ((leg.hip, leg.knee), (leg.knee, leg.ankle))
     length = USUAL_FOOT * sum(
         float(np.median(np.linalg.norm(end - start, axis=-1))) for start, end in bones
     )
     ahead = [0.0, -USUAL_DROP, np.sqrt(1.0 - USUAL_DROP**2)]
-    return length * Rotation.from_quat(ankle_from_foot, scalar_first=True).apply(ahead), length
+    return length * rigs.rotation(ankle_from_foot).apply(ahead), length
 
 
 def _with_end(recording: Recording, joint: int, offset_ls: np.ndarray) -> Recording:

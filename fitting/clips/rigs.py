@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import ArrayLike, Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from jaxik.world.body import LEG
@@ -48,6 +48,12 @@ def unit(v: Float64[np.ndarray, "*b 3"]) -> np.ndarray:
 def reject(v: Vectors, axis: Vectors) -> Vectors:
     """The part of `v` perpendicular to the unit vector `axis`."""
     return v - axis * np.sum(v * axis, axis=-1, keepdims=True)
+
+
+def rotation(wxyz: ArrayLike) -> Rotation:
+    """Quaternions as rotations, those of several joints one after another."""
+    quats = np.asarray(wxyz, np.float64)
+    return Rotation.from_quat(quats.reshape(-1, 4) if quats.ndim > 2 else quats, scalar_first=True)
 
 
 def knee_hinges(hip: Vectors, knee: Vectors, ankle: Vectors, left_ws: Vectors) -> Vectors:
@@ -235,8 +241,8 @@ def measure_soles(
         above = [np.median(heights_ws[frames], axis=0) for frames in stances if len(frames)]
         above = np.array(above) - floor
         (ankle_height, ball_height), balls = np.median(above, axis=0), above[:, 1]
-        axes = _rotation(np.asarray(rig.ankle_from_foot, np.float64)[leg : leg + 1])
-        foot_rot = _rotation(rotations_ws[:, ankle]) * axes
+        axes = rotation(np.asarray(rig.ankle_from_foot)[leg : leg + 1])
+        foot_rot = rotation(rotations_ws[:, ankle]) * axes
         bone = foot_rot.inv().apply(positions_ws[:, ankle] - positions_ws[:, toe])
         rise = np.median(bone[:, 1])  # of the ankle over the ball of a flat foot
         level = np.quantile(balls, 0.9) - np.quantile(balls, 0.1) <= LEVEL * foot
@@ -294,7 +300,7 @@ def left_directions(
     """
     if (side > 0).any() and (side < 0).any():
         return unit(hips_ws[:, side > 0].mean(axis=1) - hips_ws[:, side < 0].mean(axis=1))
-    return _rotation(pelvis_rotations_ws).apply([1.0, 0.0, 0.0])
+    return rotation(pelvis_rotations_ws).apply([1.0, 0.0, 0.0])
 
 
 def leg_motion(
@@ -316,7 +322,7 @@ def _measure_leg(leg: LegMotion, stance: Bool[np.ndarray, " frames"]) -> LegMeas
 def knee_axis(leg: LegMotion) -> Float64[np.ndarray, "3"]:
     """Unit axis in knee space about which a positive rotation opens the knee."""
     hinges_ws = knee_hinges(leg.hip, leg.knee, leg.ankle, leg.left_ws)
-    knee_rot = _rotation(leg.knee_rot)
+    knee_rot = rotation(leg.knee_rot)
     flexing_ls = np.mean(knee_rot.inv().apply(hinges_ws), axis=0)
     if knee_motion(leg) < KNEE_MOTION:
         return -flexing_ls / np.linalg.norm(flexing_ls)
@@ -331,7 +337,7 @@ def knee_motion(leg: LegMotion) -> float:
 
 def _knee_rotations(leg: LegMotion) -> Vectors:
     """Rotations of the knee from its mean, relative to the thigh, as rotation vectors, rad."""
-    local = _rotation(leg.hip_rot).inv() * _rotation(leg.knee_rot)
+    local = rotation(leg.hip_rot).inv() * rotation(leg.knee_rot)
     return (local.mean().inv() * local).as_rotvec()
 
 
@@ -396,12 +402,8 @@ def foot_axes(leg: LegMotion, flat: Bool[np.ndarray, " frames"]) -> Float64[np.n
     forward = np.where(forward.any(axis=-1, keepdims=True), forward, [0.0, 0.0, 1.0])
     up = np.broadcast_to(UP, forward.shape)
     axes = np.stack([np.cross(up, forward), up, forward], axis=-1)
-    mean = (_rotation(leg.ankle_rot[flat]).inv() * Rotation.from_matrix(axes)).mean()
+    mean = (rotation(leg.ankle_rot[flat]).inv() * Rotation.from_matrix(axes)).mean()
     return mean.as_quat(canonical=True, scalar_first=True)
-
-
-def _rotation(wxyz: Rotations) -> Rotation:
-    return Rotation.from_quat(wxyz, scalar_first=True)
 
 
 def remarks(

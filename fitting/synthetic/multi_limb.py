@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.clips.assemble import JointMotion, clip_from_joints
 from fitting.clips.clip import Clip
-from fitting.clips.rigs import knee_positions, leg_rotations, unit
+from fitting.clips.rigs import knee_positions, leg_rotations, rotation, unit
 
 from . import terrain_meshes
 from .footsteps import FootMotion, GroundPath, smoothstep
@@ -209,7 +209,7 @@ def climb(seconds: float = 6.0, fps: float = 30.0, seed: int = 0, *, start: floa
     """
     flat = locomotion(CLIMBER, seconds, fps, seed, Route(start, bend=0.0))
     wall = terrain_meshes.WALL_FROM_FLOOR
-    rotations = wall * Rotation.from_quat(flat.rotations_ws.reshape(-1, 4), scalar_first=True)
+    rotations = wall * rotation(flat.rotations_ws)
     rotations_ws = rotations.as_quat(scalar_first=True).reshape(flat.rotations_ws.shape)
     return flat.with_motion(flat.positions_ws @ wall.as_matrix().T, rotations_ws)
 

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.clips.assemble import common_rate
 from fitting.clips.clip import Y_UP_FROM_Z_UP, Clip, Recording, local_from_world
+from fitting.clips.rigs import rotation
 
 CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
 
@@ -246,10 +247,7 @@ def bvh_text(clip: Clip) -> tuple[str, tuple[str, ...]]:
     offsets = clip.offsets_ls if clip.channels else np.median(positions_ls, axis=0)
     own = [_own_channels(clip, joint) for joint in range(len(clip.parents))]
     orders = [_order(channels) for channels in own]
-    rotations = [
-        turn * Rotation.from_quat(rot, scalar_first=True) * turn.inv()
-        for rot in np.moveaxis(rotations_ls, 1, 0)
-    ]
+    rotations = [turn * rotation(wxyz) * turn.inv() for wxyz in np.moveaxis(rotations_ls, 1, 0)]
     angles = _continuous_angles(orders, rotations)
     joints = []
     for joint, name in enumerate(_names(clip)):

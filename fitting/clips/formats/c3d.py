@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from fitting.clips import joint_maps
 from fitting.clips.clip import Recording, local_from_world
 from fitting.clips.joint_maps import LEG_NAMES, LEG_ROLES, Leg, find_roles
-from fitting.clips.rigs import Vectors, leg_rotations, reject, unit
+from fitting.clips.rigs import Vectors, leg_rotations, reject, rotation, unit
 from fitting.runtime.validation import error_context
 
 from .c3d_file import AXES, UNITS, Markers, listed, read_markers
@@ -262,10 +262,7 @@ class JointMotion:
         if len(known) == 1:
             return np.stack(bridged, axis=1), np.tile(rotations, (len(frames), 1, 1))
         within = np.clip(frames, known[0], known[-1])
-        turns = [
-            Slerp(known, Rotation.from_quat(turn, scalar_first=True))(within)
-            for turn in rotations.swapaxes(0, 1)
-        ]
+        turns = [Slerp(known, rotation(turn))(within) for turn in rotations.swapaxes(0, 1)]
         quaternions = [turn.as_quat(scalar_first=True) for turn in turns]
         return np.stack(bridged, axis=1), np.stack(quaternions, axis=1)
 
@@ -435,7 +432,7 @@ def _leg_rotations(
     hip, knee, ankle, toe = leg
     thigh, shin = leg_rotations(hip, knee, ankle, left)
     if heel is None:
-        hinge = Rotation.from_quat(shin, scalar_first=True).apply([1.0, 0.0, 0.0])
+        hinge = rotation(shin).apply([1.0, 0.0, 0.0])
         foot = _axes(hinge, np.cross(toe - ankle, hinge))
     else:
         up = reject(ankle - heel, unit(toe - heel))

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from fitting.clips.clip import Clip, local_from_world, world_from_local
-from fitting.clips.rigs import unit
+from fitting.clips.rigs import rotation, unit
 
 COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
 MAGIC, VERSION = b"glTF", 2
@@ -157,7 +156,7 @@ def _body(places: np.ndarray, parents: tuple[int, ...], buffer: _Buffer) -> dict
 def _inverse_bind_matrices(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """From the space of the skeleton to that of each joint in the rest pose, columns first."""
     # The rows of a rotation matrix are the columns of its inverse.
-    columns = Rotation.from_quat(rotations, scalar_first=True).as_matrix()
+    columns = rotation(rotations).as_matrix()
     inverse = np.zeros((len(columns), 4, 4))
     inverse[:, :3, :3] = columns
     inverse[:, 3, :3] = -np.einsum("ji,jik->jk", positions, columns)
