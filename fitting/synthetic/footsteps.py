@@ -7,7 +7,7 @@ and the placed feet is blended in. The curves are one stride of an average adult
 over its phase 0..1. Phase 0 is the touchdown of the ball of the foot; the other foot is half a
 stride later.
 
-Feet that are told where to stand lie flat, rise about the ball, and swing as people move their
+Feet with given footholds lie flat, rise about the ball, and swing as people move their
 hands: along the path of minimum jerk, with an arc above it.
 """
 
@@ -166,11 +166,8 @@ class Footsteps:
         yaw, next_yaw = self._yaw(stance), self._yaw(stance + 1)
         yaw = yaw + smoothstep(swing) * (next_yaw - yaw)
         pitch = self._pitch(stance, phase, still)
-        ankle = ball - FOOT * _directions(yaw, pitch)
-        heading = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
-        tilt = Rotation.from_rotvec((FLAT - pitch)[:, None] * [1.0, 0.0, 0.0])
         stands = (phase < BALL_OFF) | (still >= 1.0)  # rounding may lift `still` above 1
-        return FootMotion(ball, ankle, (heading * tilt).as_quat(scalar_first=True), stands)
+        return _foot_motion(ball, yaw, pitch, stands)
 
     def _swinging_ball(
         self, stance: np.ndarray, phase: np.ndarray, swing: np.ndarray
@@ -262,10 +259,15 @@ def sample_footsteps(
     )
 
 
-def _directions(yaw: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-    """Unit vectors, (frames, 3), with this yaw and elevation, rad."""
+def _foot_motion(
+    ball: np.ndarray, yaw: np.ndarray, pitch: np.ndarray, stance: np.ndarray
+) -> FootMotion:
+    """A foot by its ball, m, its heading, and its elevation from ankle to ball, rad."""
     level = np.cos(pitch)[:, None] * heading_vectors(yaw)
-    return level + np.sin(pitch)[:, None] * [0.0, 1.0, 0.0]
+    ankle = ball - FOOT * (level + np.sin(pitch)[:, None] * [0.0, 1.0, 0.0])
+    heading = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
+    tilt = Rotation.from_rotvec((FLAT - pitch)[:, None] * [1.0, 0.0, 0.0])
+    return FootMotion(ball, ankle, (heading * tilt).as_quat(scalar_first=True), stance)
 
 
 class Foothold(NamedTuple):
@@ -316,11 +318,7 @@ def stepping_foot(time: np.ndarray, footholds: Sequence[Foothold], swing: Swing)
     risen = smoothstep((time - end[last] + HEEL_RISE) / HEEL_RISE)
     risen = np.where(stance, risen, 1.0 - smoothstep(phase / 0.8)) * (following > last)
     pitch = FLAT - swing.toe_off * risen
-    along = np.cos(pitch)[:, None] * heading_vectors(yaw)
-    ankle = ball - FOOT * (along + np.sin(pitch)[:, None] * [0.0, 1.0, 0.0])
-    heading = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
-    tilt = Rotation.from_rotvec((FLAT - pitch)[:, None] * [1.0, 0.0, 0.0])
-    return FootMotion(ball, ankle, (heading * tilt).as_quat(scalar_first=True), stance)
+    return _foot_motion(ball, yaw, pitch, stance)
 
 
 def curve(series: tuple, phase: np.ndarray) -> np.ndarray:

@@ -100,42 +100,33 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Slip:
-    """Seconds in which the root moves faster or slower than the feet step, as game roots do."""
+class Event:
+    """A part of a walk."""
 
     start: float
     """Seconds."""
     end: float
     """Seconds."""
+
+
+@dataclass(frozen=True)
+class Slip(Event):
+    """The root moves faster or slower than the feet step, as game roots do."""
+
     speed_change: float
     """Fraction of the walking speed, added; negative if the root lags behind."""
 
 
-@dataclass(frozen=True)
-class Slide:
-    """Seconds in which the walk freezes and the whole body glides on at walking speed."""
-
-    start: float
-    """Seconds."""
-    end: float
-    """Seconds."""
+class Slide(Event):
+    """The walk freezes and the whole body glides on at walking speed."""
 
 
-@dataclass(frozen=True)
-class Stop:
-    """Seconds in which the walk slows down, stands on both feet, and walks on.
+class Stop(Event):
+    """The walk slows down, stands on both feet, and walks on.
 
     It slows down from `start` for 0.4 to 1.5 s, until the next step is complete, and then stands
     exactly still until `end`.
     """
-
-    start: float
-    """Seconds."""
-    end: float
-    """Seconds."""
-
-
-Event = Slip | Slide | Stop
 
 
 class SpeedProfile(NamedTuple):
