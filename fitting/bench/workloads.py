@@ -83,9 +83,9 @@ def walk(frame_count: int, *, uneven_pace: bool = False) -> Clip:
     return walker.walk(seconds, FPS, SEED, events)
 
 
-def mesh_field(cells: int, seed: int = 0) -> meshes.Mesh:
+def mesh_field(cells: int) -> meshes.Mesh:
     """A square of hills and rubble, EXTENT a side: 2 cells² triangles of about one size."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     pitch = EXTENT / cells
     lines = np.arange(cells + 1) * pitch
     x, z = np.meshgrid(lines, lines, indexing="ij")
@@ -103,9 +103,9 @@ def ground(mesh: meshes.Mesh) -> terrain.Terrain:
     return terrain.mesh(np.asarray(mesh.vertices, np.float32), mesh.faces)
 
 
-def ray_origins(count: int, seed: int = 1) -> Float[np.ndarray, "rays 3"]:
+def ray_origins(count: int) -> Float[np.ndarray, "rays 3"]:
     """Random points above the mesh field, m."""
-    origins = np.random.default_rng(seed).uniform(0.0, EXTENT, (count, 3))
+    origins = np.random.default_rng(1).uniform(0.0, EXTENT, (count, 3))
     origins[:, 1] = 5.0
     return origins.astype(np.float32)
 
@@ -227,9 +227,9 @@ class Crowd(eqx.Module):
         )
 
 
-def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
+def crowd(characters: int, frame_count: int) -> Crowd:
     """Characters that walk on the mesh field for so many frames each."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     clip = walk(2 * frame_count)
     drawn = {
         name: jnp.asarray(random.uniform(low, high, characters))

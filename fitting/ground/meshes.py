@@ -64,6 +64,7 @@ MOST_PACKED = 1040  # bytes of a picture for each of its file: deflate reaches 1
 
 
 @dataclass(frozen=True, kw_only=True)
+ABOVE = 100.0  # m, at which rays start
 class TerrainOptions:
     """How the numbers of a terrain's file become metres with y up; without any, it has both."""
 
@@ -323,43 +324,35 @@ def _silent_trimesh() -> Iterator[None]:
         log.propagate = before
 
 
-def height_function(
-    surface: terrain.Terrain, above: float = 100.0
-) -> Callable[[np.ndarray], np.ndarray]:
+def height_function(surface: terrain.Terrain) -> Callable[[np.ndarray], np.ndarray]:
     """A function from points (points, 3), m, to the height of the highest ground below them, m.
 
-    The height is NaN where there is no ground.
-
-    Args:
-        surface: terrain with y up.
-        above: m, height at which the rays start.
+    The terrain has y up. The height is NaN where there is no ground.
     """
 
     def height_under(points_ws: np.ndarray) -> np.ndarray:
-        hit = _cast_down(surface, points_ws, above)
+        hit = _cast_down(surface, points_ws)
         return np.where(hit.found > 0, np.asarray(hit.point)[..., 1], np.nan)
 
     return height_under
 
 
-def normal_function(
-    surface: terrain.Terrain, above: float = 100.0
-) -> Callable[[np.ndarray], np.ndarray]:
+def normal_function(surface: terrain.Terrain) -> Callable[[np.ndarray], np.ndarray]:
     """A function from points (points, 3), m, to the unit normal of the highest ground below them.
 
     The normal is the up axis where there is no ground; see `height_function`.
     """
 
     def normal_under(points_ws: np.ndarray) -> np.ndarray:
-        hit = _cast_down(surface, points_ws, above)
+        hit = _cast_down(surface, points_ws)
         return np.where(hit.found[:, None] > 0, hit.normal, [0.0, 1.0, 0.0])
 
     return normal_under
 
 
-def _cast_down(surface: terrain.Terrain, points_ws: np.ndarray, above: float) -> terrain.Hit:
-    origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, above, 0])
-    return terrain.cast(surface, origins, jnp.asarray(2 * above))
+def _cast_down(surface: terrain.Terrain, points_ws: np.ndarray) -> terrain.Hit:
+    origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, ABOVE, 0])
+    return terrain.cast(surface, origins, jnp.asarray(2 * ABOVE))
 
 
 class Mesh(NamedTuple):

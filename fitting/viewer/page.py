@@ -555,15 +555,12 @@ class Latest:
                     self._changed.notify_all()
 
 
-def open_server(
-    host: str, port: int, title: str, *, own_pages_only: bool = True
-) -> viser.ViserServer:
+def open_server(host: str, port: int, *, own_pages_only: bool = True) -> viser.ViserServer:
     """A page without anything on it; the next free port is taken where this one is in use.
 
     Args:
         host: the address on which to listen.
         port: 0 for any that is free.
-        title: of the page.
         own_pages_only: whether pages that other machines serve cannot connect to it.
 
     Raises:
@@ -576,7 +573,7 @@ def open_server(
     except (OSError, UnicodeError) as error:
         raise ValueError(f"--host {host}: no address of this machine: {error}") from None
     with _silenced(), _origins(OWN if own_pages_only else None):
-        server = viser.ViserServer(host, port, title, verbose=False)
+        server = viser.ViserServer(host, port, "jaxik view", verbose=False)
     server.request_share_url = lambda *_, **__: None  # no client opens a tunnel to this machine
     server.gui.configure_theme(
         control_width="large",

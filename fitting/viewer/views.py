@@ -48,7 +48,7 @@ def opened(session: viewer.Session, folder: Path, address: Address = Address()) 
     page = _page()
     with ExitStack() as stack:
         server = page.open_server(
-            address.host, address.port, "jaxik view", own_pages_only=address.host in LOOPBACK
+            address.host, address.port, own_pages_only=address.host in LOOPBACK
         )
         stack.callback(page.stop, server)
         with activity.announced("Preparing the page"):

@@ -316,7 +316,7 @@ def test_only_pages_of_its_own_address_on_this_machine_can_connect_and_titles_ar
 
     from fitting.viewer.page import literal, open_server, stop
 
-    server = open_server("127.0.0.1", 0, "test")
+    server = open_server("127.0.0.1", 0)
     try:
         address = f"127.0.0.1:{server.get_port()}"
         protocol = Subprotocol(f"viser-v{importlib.metadata.version('viser')}")
@@ -328,5 +328,5 @@ def test_only_pages_of_its_own_address_on_this_machine_can_connect_and_titles_ar
     finally:
         stop(server)
     with pytest.raises(ValueError, match="--host 192.0.2.1: no address of this machine"):
-        open_server("192.0.2.1", 0, "test")
+        open_server("192.0.2.1", 0)
     assert literal("<img src=x>") == r"\<img src=x\>" and literal("walk 2") == "walk 2"
