@@ -3,7 +3,7 @@
 A clip goes through three stages. A reader in `formats` turns a file into a `Recording`, in the
 file's own unit and axes. `assemble` finds scale, up axis, frame rate and legs, and measures the
 rig. The result is a `Clip`, in metres with y up, which `edit` changes and `save_clip` stores.
-`contacts` says when feet stand, `clip_frames` makes of a clip what the foot IK pipeline takes.
+`contacts` says when feet stand, `clip_frames` turns a clip into the input of the foot IK pipeline.
 
 The flat animation below a captured motion is in `fitting.motion.flat_animation`.
 

@@ -36,7 +36,7 @@ UP_ADVICE = "give --up (up=... in Python) if you know better"
 UPRIGHT = 0.5, 0.8  # of the way from feet to pelvis: how far it goes up at least, and surely
 HUGE = 1e12  # units of a file, whatever they are
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
-RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
+RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24; `Clip.raw_frame_time` stays
 
 
 def clip_from_recording(
@@ -241,7 +241,7 @@ def common_rate(frame_time: float, remarks: list[str]) -> float:
     rate = 1.0 / frame_time
     common = min(RATES, key=lambda candidate: abs(candidate - rate))
     if abs(common - rate) > RATE_TOLERANCE * common:
-        remarks.append(f"the rate {rate:.6g} Hz is not a usual one and was kept")
+        remarks.append(f"the rate {rate:.6g} Hz is unusual, and stays as it is")
         return rate
     if abs(common - rate) > 0.0005 * common:
         remarks.append(f"the frame time {frame_time:g} s is {rate:.6g} Hz; taken as {common} Hz")

@@ -91,7 +91,7 @@ def frames_from_clip(
 def raised(clip: Clip, rise: Float64[np.ndarray, " frames"] | None, up_ws: Direction = UP) -> Clip:
     """The clip with the whole character moved along `up_ws` by `rise`, m, in each frame.
 
-    It keeps the contact labels that it has on its floor. None returns the same clip.
+    Its contact labels stay those that it has on its floor. None returns the same clip.
     """
     if rise is None:
         return clip

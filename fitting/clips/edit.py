@@ -24,10 +24,9 @@ def resample(clip: Clip, fps: float) -> Clip:
     """The clip at another frame rate; the same object if the rate is the same.
 
     Between two frames local rotations are interpolated along the shorter arc and local positions
-    linearly, so bones keep their lengths. Contact labels and other tracks are taken from the nearer
-    frame.
-    A frame between an unmasked and a masked one is masked. The new clip ends with the last whole
-    frame at the new rate.
+    linearly, so bones keep their lengths. Contact labels and other tracks are those of the nearer
+    frame. A frame between an unmasked and a masked one is masked. The new clip ends with the last
+    whole frame at the new rate.
 
     Raises:
         ValueError: `fps` is not a finite number above 0.
@@ -138,7 +137,7 @@ def _starts_at_rest(clip: Clip) -> bool:
 
 
 def on_floor(clip: Clip, floor: float, sole: float | None = None) -> Clip:
-    """The clip with its rig's heights over the sole measured over a floor, or given.
+    """The clip with its rig's heights over the sole measured over a floor, or set.
 
     Args:
         clip: any clip with legs.
@@ -156,7 +155,7 @@ def on_floor(clip: Clip, floor: float, sole: float | None = None) -> Clip:
     seen = clip.observed
     motion = clip.positions_ws[seen], clip.rotations_ws[seen], clip.stance_labels()[seen]
     rig = with_soles(rig, *motion, floor) if sole is None else with_sole(rig, sole)
-    others = tuple(text for text in clip.remarks if rigs.SUBJECT not in text)
+    others = tuple(text for text in clip.remarks if rigs.TOPIC not in text)
     remarks = (*others, *rigs.remarks(rig, *motion, floor))
     return replace(clip, measured_rig=rig, remarks=remarks)
 

@@ -31,11 +31,11 @@ FLAT_FRACTION = 0.25  # of a stance's frames, in which the foot is flat at least
 FLAT_RISE = 0.05  # of a foot's length, by which the ankle of a flat foot rises and falls
 LEVEL = 0.4  # of a foot's length, in which the heights of its ball lie on a level floor
 HIGHEST_BALL = 0.6  # of a foot's length, its ball's height over the sole; captured: 0.2 to 0.55
-USUAL_BALL = 0.45  # likewise, of the feet of people
+USUAL_BALL = 0.45  # the same height of the feet of people
 USUAL_ERROR = 0.02  # m, by which captured clips of adults differ from it
 USUAL_FOOT = 0.15  # of a leg's length, ankle to ball; for a foot that is a single point
 
-SUBJECT = "sole"  # a word of each of these remarks, and of no others
+TOPIC = "sole"  # a word in each of these remarks, and in no others
 OFFSET = 0.015  # m, from which feet count as off their floor
 
 
@@ -416,7 +416,7 @@ def remarks(
     """Feet that stand over or in their floor, or else those whose heights are a guess.
 
     Args:
-        rig: with the heights that were measured, guessed or given.
+        rig: with heights over the sole, however they became known.
         positions_ws: m, y up.
         rotations_ws: wxyz.
         stance: when each foot stands.
@@ -438,8 +438,8 @@ def remarks(
         )
     guessed = ~soles.measured & np.isclose(balls, soles.ball)
     return tuple(
-        f"the {name} foot stands flat on no level floor at height {floor:g}; its ankle is taken to "
-        f"be {height:.3f} m over its sole, from the foot's length"
+        f"the {name} foot never stands flat on a level floor at height {floor:g}; its ankle is "
+        f"assumed to be {height:.3f} m over its sole, from the foot's length"
         for name, height, is_guess in zip(rig.names, rig.ankle_height, guessed, strict=True)
         if is_guess
     )

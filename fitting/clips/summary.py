@@ -90,7 +90,7 @@ def contact_text(summary: Summary, leg: Summary) -> str:
 
 
 def rows(summary: Summary) -> list[list[str]]:
-    """A heading of one cell, and below it rows of a subject, which may be empty, and its text."""
+    """A heading of one cell, then rows of a label, which may be empty, and a text."""
     joints, joint_map = summary["joints"], summary["joint_map"]
     lines = [
         [
@@ -130,7 +130,7 @@ def rows(summary: Summary) -> list[list[str]]:
 def as_text(summary: Summary) -> str:
     """The summary as text for a pipe."""
     (heading,), *rest = rows(summary)
-    return "\n".join([heading, *(f"  {subject:<7} {text}" for subject, text in rest)])
+    return "\n".join([heading, *(f"  {label:<7} {text}" for label, text in rest)])
 
 
 def as_json(summary: Summary) -> str:

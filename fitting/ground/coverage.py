@@ -27,7 +27,7 @@ from .meshes import AS_IS, TerrainOptions
 
 ENOUGH = 0.8  # fraction of stances with ground under them, from which the terrain is in place
 LITTLE = 0.5  # below which there is nothing that could be fitted
-PARTLY = 0.2  # above which the unit is right; likewise of those with ground near them
+PARTLY = 0.2  # above which the unit is right; also of those with ground near them
 UNITS = (0.01, 0.001, 0.0254, 0.3048)  # m: centimetre, millimetre, inch, foot; by how usual
 FACTORS = tuple(factor for unit in UNITS for factor in (unit, 1.0 / unit))
 
@@ -241,7 +241,7 @@ def _size(terrain: Terrain) -> Float64[np.ndarray, "3"]:
 
 
 def _offset_to(terrain: Terrain, stances: _Stances) -> np.ndarray | None:
-    """By how much to move a terrain to have its middle under the feet, m; None if that is no help.
+    """By how much to move a terrain to have its middle under the feet, m; None if it does not help.
 
     It is moved in height where it is further from the feet than a step.
     """

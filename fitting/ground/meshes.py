@@ -56,15 +56,16 @@ ARCHIVE, ARRAY, PICTURE = ".npz", ".npy", ".png"
 SUFFIXES = (ARCHIVE, ARRAY, PICTURE)
 REQUIRED = ("heights", "spacing")
 OPTIONAL = ("origin", "interpolation")
-GREY = {"L": 1, "I;16": 2, "I;16B": 2, "I": 4}  # bytes a pixel, by Pillow's modes
-COLOURED = {"P": 1, "LA": 2, "RGB": 3, "RGBA": 4}  # likewise; these may hold a grey picture
+# Bytes a pixel, by Pillow's modes: of grey pictures, and of others that may hold one.
+GREY = {"L": 1, "I;16": 2, "I;16B": 2, "I": 4}
+COLOURED = {"P": 1, "LA": 2, "RGB": 3, "RGBA": 4}
 OPAQUE = 255
+ABOVE = 100.0  # m, at which rays start
 MOST_PIXELS = 2**26
 MOST_PACKED = 1040  # bytes of a picture for each of its file: deflate reaches 1032
 
 
 @dataclass(frozen=True, kw_only=True)
-ABOVE = 100.0  # m, at which rays start
 class TerrainOptions:
     """How the numbers of a terrain's file become metres with y up; without any, it has both."""
 
@@ -235,8 +236,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     kind = path.suffix.lower().removeprefix(".")
     if kind not in formats:
         raise ValueError(
-            f"{path}: wanted a heightfield ({', '.join(SUFFIXES)}) or a mesh "
-            f"that trimesh reads "
+            f"{path}: wanted a heightfield ({', '.join(SUFFIXES)}) or a mesh that trimesh reads "
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
@@ -253,7 +253,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
             mesh = scene.to_mesh()
     except gltf.RefusalError as error:
         raise ValueError(f"{path}: {in_one_line(error, QUOTED)}") from None
-    except ImportError:  # of a package that guesses encodings, which is no requirement
+    except ImportError:  # of a package that guesses encodings, which is not required
         raise ValueError(
             f"{path}: trimesh cannot read it: neither a whole binary file nor text in UTF-8"
         ) from None
@@ -340,7 +340,7 @@ def height_function(surface: terrain.Terrain) -> Callable[[np.ndarray], np.ndarr
 def normal_function(surface: terrain.Terrain) -> Callable[[np.ndarray], np.ndarray]:
     """A function from points (points, 3), m, to the unit normal of the highest ground below them.
 
-    The normal is the up axis where there is no ground; see `height_function`.
+    The terrain has y up. The normal is the up axis where there is no ground.
     """
 
     def normal_under(points_ws: np.ndarray) -> np.ndarray:

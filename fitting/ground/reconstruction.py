@@ -38,14 +38,14 @@ PITCH_STEP = 0.015  # relative; it moves the edge of 4 m of ground by 3 cm
 HEADING_STEP = np.radians(1.5)
 OFFSETS = 10  # tried in each direction
 MAX_COARSE_STANCES = 100  # evenly chosen, for ranking the coarse grids
-COARSE_KEPT = 30  # coarse grids whose neighbourhood is searched
+COARSE_BEST = 30  # coarse grids whose neighbourhood is searched
 NEIGHBOURS = (-0.75, 0.0, 0.75)  # coarse steps from a grid to those around it
 LATTICE = (-3, -2, -1, 0, 1, 2, 3)  # standard deviations, over the region of high evidence
 # Largest standard deviations of pitch, heading and the two offsets, in coarse steps.
 MAX_WIDTH = np.array([2.0, 1.0, 0.5, 0.5])
 MIN_WIDTH_RATIO = 0.1  # to the maximum
 ROUNDS = 4  # of moving to the mean of the evidence
-PARTITIONS_KEPT = 150  # partitions of the stances that cross-validation chooses from
+MOST_PARTITIONS = 150  # partitions of the stances that cross-validation chooses from
 CREDIBLE = 2.0  # nats of evidence below the best: odds of 1 to 7
 
 PLANE_NOISE = 0.01  # m: footprints farther from the plane weigh less (soft L1)
@@ -122,7 +122,7 @@ class RankedGrids:
     pitches: tuple[float, float]
     """m, range of grids nearly as probable as the best."""
     headings: tuple[float, float]
-    """rad, likewise."""
+    """rad, range of the same grids."""
 
 
 def search(feet: Footprints) -> RankedGrids:
@@ -131,7 +131,7 @@ def search(feet: Footprints) -> RankedGrids:
     1. Coarse: for every pitch and heading, the offset with the most pairs of similar heights in
        common blocks.
     2. A grid may explain the heights by chance, just where it lies. The best coarse grids are
-       therefore scored together with their neighbours, and the best neighbourhood is kept.
+       therefore scored together with their neighbours, and the best neighbourhood is chosen.
     3. Fine: a lattice of grids moves to the mean of the evidence and adapts its spacing, a few
        times.
     4. Grids of the last lattice are grouped by how they partition the stances. Each group is
@@ -141,7 +141,7 @@ def search(feet: Footprints) -> RankedGrids:
         feet: two or more footprints.
     """
     score, centre = _Evidence(feet), feet.balls.mean(axis=0)
-    coarse = sorted(_coarse_grids(feet), key=score.of, reverse=True)[:COARSE_KEPT]
+    coarse = sorted(_coarse_grids(feet), key=score.of, reverse=True)[:COARSE_BEST]
     best = max(coarse, key=lambda grid: score.of_any(_neighbours(grid, centre)))
     lattice, width = np.array(list(product(LATTICE, repeat=4))), MAX_WIDTH
     for _ in range(ROUNDS):
@@ -161,11 +161,11 @@ def search(feet: Footprints) -> RankedGrids:
     group_evidence = {
         group[0]: float(np.logaddexp.reduce(evidence[group])) for group in partitions.values()
     }
-    kept = sorted(group_evidence, key=lambda index: -group_evidence[index])[:PARTITIONS_KEPT]
+    best_groups = sorted(group_evidence, key=lambda index: -group_evidence[index])[:MOST_PARTITIONS]
     credible = [grids[index] for index in np.flatnonzero(evidence >= evidence.max() - CREDIBLE)]
     return RankedGrids(
-        tuple(grids[index] for index in kept),
-        np.array([group_evidence[index] - evidence[index] for index in kept]),
+        tuple(grids[index] for index in best_groups),
+        np.array([group_evidence[index] - evidence[index] for index in best_groups]),
         _range([grid.pitch for grid in credible]),
         _range([grid.heading for grid in credible]),
     )

@@ -356,7 +356,7 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_or_else_those_of_feet_
         assert not soles.measured.any()
         assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
         assert np.allclose(soles.ankle - soles.ball, 0.05)
-    assert len([remark for remark in walk.remarks if "no level floor" in remark]) == 2
+    assert len([remark for remark in walk.remarks if "never stands flat" in remark]) == 2
     with pytest.raises(ValueError, match="stair walk was loaded without legs"):
         _ = replace(walk, measured_rig=None).rig
 

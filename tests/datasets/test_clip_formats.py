@@ -125,7 +125,7 @@ def test_the_rate_is_rounded_to_a_common_one_and_the_frame_time_is_kept(write_bv
     ):  # fmt: skip
         clip = load_clip(write_bvh(BVH.replace("0.0083333", frame_time)))
         assert clip.fps == pytest.approx(rate) and clip.raw_frame_time == float(frame_time)
-        assert any("not a usual" in remark for remark in clip.remarks) == (rate == 10)
+        assert any("is unusual" in remark for remark in clip.remarks) == (rate == 10)
     assert load_clip(write_bvh(BVH), fps=48.0).fps == 48.0
 
 

@@ -354,7 +354,7 @@ def _channels(
     Args:
         own: channels.
         position: in the parent's space and the axes of the file, m.
-        offset: likewise, of the rest pose.
+        offset: of the rest pose, in the same axes, m.
         order: axes of the angles.
         angles: degrees.
     """

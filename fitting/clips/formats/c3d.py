@@ -39,7 +39,7 @@ SIDES = {"left": "L", "right": "R"}
 HEELS = tuple(f"{letter}HEE" for letter in SIDES.values())
 PELVIS = ("LASI", "RASI")
 BACKS = (("LPSI", "RPSI"), ("SACR",))
-# What labs store beside markers, or Plug-in Gait computes: the first that is there is taken.
+# What labs store beside markers, or Plug-in Gait computes: the first that a file has is used.
 MODELLED = {"hip": ("HJC", "FEP"), "knee": ("KJC", "FEO"), "ankle": ("AJC", "TIO")}
 MARKED = {"hip": (), "knee": ("KNE", "THI"), "ankle": ("ANK", "TIB")}
 
@@ -161,7 +161,7 @@ def hip_centres(
 
     Args:
         left_asis: marker on the left anterior spine, m.
-        right_asis: likewise.
+        right_asis: marker on the right anterior spine, m.
         back: middle between the posterior spines, or the sacrum, m.
         width: m between the anterior spines; None measures it, as the depth, over all frames.
     """
@@ -241,8 +241,8 @@ class Skeleton(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class JointMotion:
-    """Joints in the frames in which they are known."""
+class MarkerJoints:
+    """Joints in the frames in which their markers were seen."""
 
     skeleton: Skeleton
     """In those frames alone."""
@@ -288,7 +288,7 @@ def bridge(
     return np.stack([np.interp(frames, known, column) for column in places.T], axis=-1)
 
 
-def from_plug_in_gait(markers: Markers, subject: Subject, scale: float | None) -> JointMotion:
+def from_plug_in_gait(markers: Markers, subject: Subject, scale: float | None) -> MarkerJoints:
     """The joints of a subject that wears the markers of Plug-in Gait.
 
     Args:
@@ -316,7 +316,7 @@ def from_plug_in_gait(markers: Markers, subject: Subject, scale: float | None) -
             f"without {' and '.join(unseen)}, how a foot rolls is a guess: as its knee's hinge does"
         )
     pelvis = [raw["LASI"], raw["RASI"], np.mean([raw[name] for name in subject.back], axis=0)]
-    return JointMotion(_skeleton(joints, pelvis, heels), known, used, guess, (*remarks, *more))
+    return MarkerJoints(_skeleton(joints, pelvis, heels), known, used, guess, (*remarks, *more))
 
 
 def _guess_unit(width: float, remarks: list[str]) -> float:
@@ -331,7 +331,7 @@ def _guess_unit(width: float, remarks: list[str]) -> float:
     return UNITS[unit_name]
 
 
-def from_map(markers: Markers, joints: Mapping[str, str]) -> JointMotion:
+def from_map(markers: Markers, joints: Mapping[str, str]) -> MarkerJoints:
     """The joints that a joint map names by their markers.
 
     Args:
@@ -352,7 +352,7 @@ def from_map(markers: Markers, joints: Mapping[str, str]) -> JointMotion:
     pelvis = [positions[:, index] for index in members["pelvis"]]
     if len(pelvis) > 3:
         pelvis = [*pelvis[:2], np.mean(pelvis[2:], axis=0)]
-    return JointMotion(_skeleton(places, pelvis if len(pelvis) == 3 else [], {}), known, used)
+    return MarkerJoints(_skeleton(places, pelvis if len(pelvis) == 3 else [], {}), known, used)
 
 
 def _members(markers: Markers, role: str, text: str) -> list[int]:
@@ -549,7 +549,7 @@ def _up_axis(markers: Markers) -> str | None:
     return {"Y": "y", "Z": "z"}.get(markers.up.lstrip("+"))
 
 
-def _recording(markers: Markers, motion: JointMotion) -> Recording:
+def _recording(markers: Markers, motion: MarkerJoints) -> Recording:
     """Joints in all frames, from those in which they are known."""
     names, parents, known_ws, _ = motion.skeleton
     positions_ls, rotations_ls = local_from_world(parents, *motion.in_all_frames())
@@ -580,11 +580,11 @@ def _gaps(
     names = [f"{markers.names[used[index]]} in {lost[index]}" for index in order]
     return (
         f"{(~known).sum()} of {len(known)} frames are masked, as markers were not seen "
-        f"({listed(names)}): no fit looks at them, and joints move there on straight lines",
+        f"({listed(names)}): fits ignore them, and joints move there on straight lines",
     )
 
 
-def _uneven_bones(motion: JointMotion) -> tuple[str, ...]:
+def _uneven_bones(motion: MarkerJoints) -> tuple[str, ...]:
     """A remark for each bone of a leg whose length changes as no bone's does.
 
     From one frame to the next it jumps where markers are swapped. Skin that moves over the bone,

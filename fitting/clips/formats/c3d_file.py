@@ -256,7 +256,7 @@ class Markers:
     right: str
     """Axis to the right on a screen (POINT:X_SCREEN), such as "+X"; empty if not stated."""
     up: str
-    """Axis upwards on a screen (POINT:Y_SCREEN); likewise."""
+    """Axis upwards on a screen (POINT:Y_SCREEN); empty if not stated."""
     measures: Mapping[str, float]
     """What was measured on the subject (PROCESSING), mm, by names in capitals."""
     remarks: tuple[str, ...] = ()
@@ -287,10 +287,10 @@ def read_markers(path: Path) -> Markers:
     labels = (_labels(structure, "LABELS") + [""] * count)[:count]
     stated = _stated_outputs(structure)
     guessed = [name for name in labels if name not in stated and OUTPUT_NAME.search(name)]
-    kept = [n for n, label in enumerate(labels) if label not in stated and label not in guessed]
-    if not kept:
+    selected = [n for n, label in enumerate(labels) if label not in stated and label not in guessed]
+    if not selected:
         raise ValueError(f"no markers, only {count} angles, forces and the like; wanted markers")
-    points, names = points[:, kept], _unique_names(labels)
+    points, names = points[:, selected], _unique_names(labels)
     remark = f"taken for angles, forces or the like by their names, and left out: {listed(guessed)}"
     positions, lost = points[..., :3], np.signbit(points[..., 3])
     lost |= (positions == 0.0).all(axis=-1) | ~np.isfinite(positions).all(axis=-1)
@@ -298,7 +298,7 @@ def read_markers(path: Path) -> Markers:
     if not SLOWEST <= rate <= FASTEST:
         raise ValueError(f"POINT:RATE is {rate:g} Hz; wanted {SLOWEST:g} to {FASTEST:g}")
     return Markers(
-        names=tuple(names[n] for n in kept),
+        names=tuple(names[n] for n in selected),
         positions=np.where(lost[..., None], np.nan, positions),
         frame_time=1.0 / rate,
         metres_per_unit=UNITS.get(_text(structure, "UNITS").lower()),

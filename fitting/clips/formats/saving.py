@@ -69,7 +69,7 @@ def check_clip_file(path: Path, clip: Clip | None = None, *, with_ground: bool =
     Args:
         path: file name.
         clip: None checks the name only.
-        with_ground: whether a mesh is to be written too.
+        with_ground: whether a mesh is written too.
 
     Raises:
         ValueError: it cannot.
