@@ -4,7 +4,7 @@ Each benchmark is timed next to comparable programs and to the limits of the mac
 bandwidth, arithmetic and dispatch. It says nothing about the quality of a motion; for that see
 `fitting.motion`.
 
-Start with `suite`, which lists the benchmarks and calls them in turn. Each is a function that fills
-a `measurement.Measurement`; `report` writes what they measured. `workloads` makes what they run on,
-with its `Sizes`. `README.md` has results.
+Start with `benchmarks`: each is a function that fills a `measurement.Measurement`, on `workloads`
+of given `Sizes`. `baselines` are comparable programs, `processes` what runs in processes of their
+own, `roofline` the limits of the machine, `report` the table and files. `README.md` has results.
 """

@@ -32,10 +32,10 @@ def bench(options: argparse.Namespace) -> int:
 
     Ctrl-C prints, and writes, what has been measured so far, with status 130.
     """
-    from fitting.bench import measurement, report, suite
+    from fitting.bench import benchmarks, measurement, report
     from fitting.bench.workloads import FULL, QUICK
 
-    chosen = suite.choose(suite.BENCHMARKS, options.only, options.quick)
+    chosen = benchmarks.choose(benchmarks.BENCHMARKS, options.only, options.quick)
     plot = report.check_output_files(options.json, options.plot)
     sizes = QUICK if options.quick else FULL
     title = f"Running {len(chosen)} benchmarks"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.bench import fits, kernels, measurement, report, roofline, suite, throughput, workloads
+from fitting.bench import baselines, benchmarks, measurement, processes, report, roofline, workloads
 from fitting.bench.measurement import Benchmark, Figure, Measurement, Series
 from fitting.bench.roofline import Work
 from fitting.bench.workloads import Sizes
@@ -22,6 +22,7 @@ from fitting.clips.clip_frames import frames_from_clip
 from fitting.inference.optimise.search import find_best_fit
 from fitting.runtime import machine
 from fitting.runtime.threads import usable_cores
+from fitting.viewer.session import DEFAULT
 from jaxik import presets
 from support.clips import assert_close
 from support.commands import refusal
@@ -162,14 +163,14 @@ def trivial_suite(monkeypatch):
     child = measurement.subprocess.CalledProcessError(
         1, "python", stderr="Traceback\nKeyError: 'a'\n"
     )
-    benchmarks = {
+    rows = {
         "full": Benchmark("a row that fails", "", Mock(side_effect=MemoryError)),
         "child": Benchmark("a row whose process fails", "", Mock(side_effect=child)),
         "quick": Benchmark("a quick row", "float32", quick),
         "stopped": Benchmark("a row that is stopped", "float64", stopped, True),
         "never": Benchmark("a row after that", "float32", quick),
     }
-    monkeypatch.setattr(suite, "BENCHMARKS", benchmarks)
+    monkeypatch.setattr(benchmarks, "BENCHMARKS", rows)
 
 
 def test_the_command_prints_a_table_with_the_hardware_and_its_json_is_complete(
@@ -240,11 +241,11 @@ def test_a_quick_run_has_smaller_sizes_and_no_long_benchmarks_unless_they_are_na
         if isinstance(full, tuple):
             quick, full = sorted(quick), sorted(full)
         assert quick <= full or quick[-1] <= full[-1], field.name
-    benchmarks = suite.BENCHMARKS
-    left_out = set(benchmarks) - set(suite.choose(benchmarks, None, quick=True))
+    rows = benchmarks.BENCHMARKS
+    left_out = set(rows) - set(benchmarks.choose(rows, None, quick=True))
     assert left_out == {"clips", "first", "fit", "many", "scaling"}
-    assert list(suite.choose(benchmarks, "fit", quick=True)) == ["machine", "fit"]
-    assert list(suite.choose(benchmarks, None)) == list(benchmarks)
+    assert list(benchmarks.choose(rows, "fit", quick=True)) == ["machine", "fit"]
+    assert list(benchmarks.choose(rows, None)) == list(rows)
 
 
 # Each benchmark at small sizes
@@ -273,8 +274,8 @@ def legs():
 
 def run_suite(name: str, sizes: Sizes = SMALL) -> measurement.Report:
     """Runs the benchmark of the ceilings and this one."""
-    benchmarks = suite.choose(suite.BENCHMARKS, name)
-    return measurement.run_benchmarks(benchmarks, sizes, True, lambda line: None)
+    rows = benchmarks.choose(benchmarks.BENCHMARKS, name)
+    return measurement.run_benchmarks(rows, sizes, True, lambda line: None)
 
 
 def measure(name: str, **changes) -> Measurement:
@@ -299,7 +300,9 @@ def test_the_ceilings_of_the_machine_are_its_best_runs():
 
 def test_import_times_do_not_include_that_of_jax(monkeypatch):
     commands = []
-    monkeypatch.setattr(kernels.subprocess, "run", lambda command, check: commands.append(command))
+    monkeypatch.setattr(
+        benchmarks.subprocess, "run", lambda command, check: commands.append(command)
+    )
     timings = measure("start", repeats=1)
     seconds = {name: samples[0] for name, samples in timings.samples.items()}
     figure = figures(timings)["import jaxik, beyond jax's"]
@@ -316,9 +319,9 @@ def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs,
     ratio = np.median(timings.samples["NumPy"]) / np.median(timings.samples["ours"])
     assert figures(timings)["NumPy's time in ours"].value == pytest.approx(ratio)
     assert figures(measure("feet"))["a leg and core"].at_most == 110.0
-    corrections = kernels.leg_corrections(legs.ik, legs.lanes)
+    corrections = benchmarks.leg_corrections(legs.ik, legs.lanes)
     ours = [np.asarray(rotations)[0].T for rotations in corrections]
-    theirs = kernels.two_bone(*kernels.numpy_arguments(legs))
+    theirs = baselines.two_bone(*baselines.numpy_arguments(legs))
     for our_rot, their_rot in zip(ours, theirs, strict=True):
         assert_close(np.abs(np.sum(our_rot * their_rot, axis=-1)), np.ones(200), 1e-4)
         assert np.ptp(our_rot[:, 0]) > 1e-3  # the legs differ
@@ -330,7 +333,7 @@ def test_rays_are_compared_with_embree_where_it_is_installed(monkeypatch):
     first = "Embree, which triangle"
     ratio = np.median(timings.samples[first]) / np.median(timings.samples["ours"])
     assert figures(timings)[f"{first}: its time in ours"].value == pytest.approx(ratio)
-    monkeypatch.setattr(kernels.meshes, "embree_tracer", lambda vertices, faces: None)
+    monkeypatch.setattr(benchmarks.meshes, "embree_tracer", lambda vertices, faces: None)
     timings = measure("rays")
     assert list(timings.samples) == ["ours"] and "not installed" in timings.notes[0]
 
@@ -351,9 +354,9 @@ def test_a_crowd_in_chunks_is_the_whole_crowd():
 
     with jax.enable_x64(False):
         people = workloads.crowd(5, 24)
-        flat = workloads.single(kernels.plane())
+        flat = workloads.single(benchmarks.plane())
         timings = Measurement("crowd", "crowd", 1)
-        parts = throughput.in_chunks(timings, "plane", places, people, flat, 2)()
+        parts = benchmarks.in_chunks(timings, "plane", places, people, flat, 2)()
         parts = [jnp.moveaxis(part, -1, 0) for part in parts]  # members are last
         whole = jax.vmap(lambda member: places(people, flat, member))(people.members)
     first, second, last = parts
@@ -368,7 +371,7 @@ def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(mon
     def outputs(ik, crowd, ground, frames):
         return (ik.leg.soften * frames.pose.ankle.pos + ground.up_ws,)
 
-    monkeypatch.setattr(throughput, "_outputs", outputs)
+    monkeypatch.setattr(benchmarks, "_outputs", outputs)
     of_crowd = figures(measure("crowd"))
     wider = 1.0 / measurement.time_in_width()
     assert of_crowd["plane, leg-frames a second"].at_least == pytest.approx(9.0 * wider)
@@ -379,8 +382,10 @@ def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(mon
     assert figures(timings)["reverse in forward runs"].value == pytest.approx(ratio)
 
     character = SimpleNamespace(step=lambda frame: None)
-    monkeypatch.setattr(kernels.jaxik, "step", lambda ik, rig, ground, state, frame: frame.weight)
-    monkeypatch.setattr(kernels.jaxik, "Character", lambda ik, rig, ground: character)
+    monkeypatch.setattr(
+        benchmarks.jaxik, "step", lambda ik, rig, ground, state, frame: frame.weight
+    )
+    monkeypatch.setattr(benchmarks.jaxik, "Character", lambda ik, rig, ground: character)
     timings = measure("step")
     assert figures(timings)["Character on a plane"].at_most == 150.0
     calls = {f"{ground}{call}" for ground in ("plane", "mesh") for call in CALLS}
@@ -394,9 +399,9 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
 
 
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
-    session = throughput.session(12)
+    session = benchmarks.viewed_walk(12)
     (clip,), (system,) = session.clips, session.starts.values()
-    assert clip.animation.clip.fps == throughput.RATE and clip.animation.clip.frame_count == 6
+    assert clip.animation.clip.fps == benchmarks.RATE and clip.animation.clip.frame_count == 6
     assert system.leg is not None and session.cost is not None
     problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
@@ -419,10 +424,10 @@ def small_problem(monkeypatch):
 def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interrupted(
     small_problem, monkeypatch
 ):
-    processes = []
+    commands = []
 
     def run(command, env, **options):
-        processes.append((command[1:], env["JAX_COMPILATION_CACHE_DIR"], env["JAX_ENABLE_X64"]))
+        commands.append((command[1:], env["JAX_COMPILATION_CACHE_DIR"], env["JAX_ENABLE_X64"]))
         (folder,) = json.loads(command[-1])
         assert workloads.load_recording(folder).reference.frame_count == 12
         return subprocess.CompletedProcess(command, 0, "\n1.00\n")
@@ -433,8 +438,8 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
     assert of_fit["warm"].at_most == 2.0
     assert of_fit["cold, empty cache"].at_most == 20.0
     assert of_fit["cold, persistent cache"].at_most == 5.0
-    (empty, empty_cache, x64), (full, full_cache, _) = processes
-    assert empty == full and fits.__name__ in empty[1]
+    (empty, empty_cache, x64), (full, full_cache, _) = commands
+    assert empty == full and processes.__name__ in empty[1]
     assert empty_cache == full_cache and x64 == "1"
     assert sum("cost" in figure.note for figure in timings.figures) == 3
     assert timings.samples["its search, empty cache"] == [1.0]
@@ -443,7 +448,7 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
     def interrupted(problem):
         return dataclasses.replace(find_best_fit(problem), interrupted=True)
 
-    monkeypatch.setattr(fits, "find_best_fit", interrupted)
+    monkeypatch.setattr(benchmarks, "find_best_fit", interrupted)
     stopped = run_suite("fit")
     assert stopped.interrupted and stopped.measurements[-1].figures == []
 
@@ -464,10 +469,10 @@ def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_ste
 def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     systems = []
     ik, clip = presets.record(), workloads.walk(12)
-    session = SimpleNamespace(starts={throughput.DEFAULT: ik}, rig=clip.rig)
+    session = SimpleNamespace(starts={DEFAULT: ik}, rig=clip.rig)
     solver = SimpleNamespace(solve=systems.append, animation=SimpleNamespace(clip=clip))
-    monkeypatch.setattr(throughput, "session", lambda frame_count: session)
-    monkeypatch.setattr(throughput, "Solver", lambda session: solver)
+    monkeypatch.setattr(benchmarks, "viewed_walk", lambda frame_count: session)
+    monkeypatch.setattr(benchmarks, "Solver", lambda session: solver)
     timings = measure("view")
     (figure,) = timings.figures
     assert figure.at_most == 100.0 and figure.unit == "ms"
@@ -479,7 +484,9 @@ def test_a_drag_is_measured_without_its_compilation(monkeypatch):
 
 
 def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, legs, tmp_path, monkeypatch):
-    monkeypatch.setattr(throughput, "run", lambda ik, rig, ground, motion: 2 * motion.weight)
+    monkeypatch.setattr(
+        benchmarks, "run_character", lambda ik, rig, ground, motion: 2 * motion.weight
+    )
     measured = run_suite("scaling")
     timings = measured.measurements[-1]
     assert [series.size for series in timings.series] == [
@@ -505,10 +512,10 @@ def measured(what: str, count: int) -> dict[str, float]:
 
 
 def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch):
-    monkeypatch.setattr(throughput, "_measured", measured)
-    monkeypatch.setattr(throughput, "usable_cores", lambda: 2)
+    monkeypatch.setattr(benchmarks, "_measured", measured)
+    monkeypatch.setattr(benchmarks, "usable_cores", lambda: 2)
     sizes = dataclasses.replace(SMALL, devices=(1, 4, 5, 8), clips=(10, 20, 30), workers=(1, 2))
-    throughput.many(timings := Measurement("many", "", 1), sizes)
+    benchmarks.many(timings := Measurement("many", "", 1), sizes)
     assert timings.notes[:2] == [
         "left out: 5, 8 devices, as two share each core already",
         "left out: 30 clips, as 20 failed",
@@ -517,15 +524,15 @@ def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch)
     assert [series.sizes for series in timings.series] == [[1, 4], [10], [1, 2]]
     assert figures(timings)["8 fits, 2 workers: CPU time"].value == 4.0
 
-    monkeypatch.setattr(throughput, "LONGEST", -1.0)
-    throughput.many(slow := Measurement("many", "", 1), sizes)
+    monkeypatch.setattr(benchmarks, "LONGEST", -1.0)
+    benchmarks.many(slow := Measurement("many", "", 1), sizes)
     assert [series.sizes for series in slow.series] == [[1], [10], [1]]
     assert slow.notes[0] == "left out: 4, 5, 8 devices, as 1 took 0 s"
 
 
 def test_many_keeps_what_was_measured_before_an_interrupt(monkeypatch, tmp_path):
-    monkeypatch.setattr(throughput, "_measured", measured)
-    monkeypatch.setattr(throughput, "usable_cores", lambda: 2)
+    monkeypatch.setattr(benchmarks, "_measured", measured)
+    monkeypatch.setattr(benchmarks, "usable_cores", lambda: 2)
     timings = run_suite("many", dataclasses.replace(SMALL, devices=(1, 2), clips=(40,)))
     assert timings.interrupted
     numbers, curves = tmp_path / "bench.json", tmp_path / "bench.png"
