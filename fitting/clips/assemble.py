@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from fitting.runtime.validation import error_context
+from jaxik.world.skeleton import Rig
 
 from . import guesses, rigs, skating
 from .clip import (
@@ -99,15 +100,12 @@ def clip_from_recording(
     rig = None
     if roles is not None:
         feet = _skating(roles, positions_ws, rotations_ws, rate)
-        stance = feet.stance
         with error_context(source):
             if feet.moves_root(travel):
                 positions_ws = positions_ws + feet.travel_ws[:, None]
         remarks += feet.remarks(travel)
-        if (known := recording.mask) is not None:  # nothing is measured on a guess
-            seen_ws, turned_ws, stance = positions_ws[known], rotations_ws[known], stance[known]
-        else:
-            seen_ws, turned_ws = positions_ws, rotations_ws
+        seen = slice(None) if recording.mask is None else recording.mask  # the rest is a guess
+        stance = feet.stance[seen]
         if not stance.any():
             remarks.append(
                 "no foot ever stands, neither still nor at one velocity with others; the axes of "
@@ -116,9 +114,8 @@ def clip_from_recording(
         for leg, stands in zip(roles.legs, stance.T, strict=True):
             if stance.any() and not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
-        rig = measure_rig(roles, seen_ws, turned_ws, stance)
-        remarks += rigs.knee_remarks(roles, seen_ws, turned_ws)
-        remarks += rigs.remarks(rig, seen_ws, turned_ws, stance)
+        rig, guessed = _measure(roles, positions_ws[seen], rotations_ws[seen], stance)
+        remarks += guessed
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
@@ -156,14 +153,21 @@ def clip_from_joints(
     rotations_ws = continuous(motion.rotations_ws)
     positions_ls, _ = local_from_world(motion.parents, motion.positions_ws, rotations_ws)
     roles = find_roles(motion.names, motion.parents, joints)
-    rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
-    remarks = rigs.knee_remarks(roles, motion.positions_ws, rotations_ws)
-    remarks += rigs.remarks(rig, motion.positions_ws, rotations_ws, motion.stance)
+    rig, remarks = _measure(roles, motion.positions_ws, rotations_ws, motion.stance)
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
         stance=motion.stance, remarks=remarks,
     )  # fmt: skip
+
+
+def _measure(
+    roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray, stance: np.ndarray
+) -> tuple[Rig, tuple[str, ...]]:
+    """The rig, and remarks on what is a guess about it."""
+    rig = measure_rig(roles, positions_ws, rotations_ws, stance)
+    guessed = rigs.knee_remarks(roles, positions_ws, rotations_ws)
+    return rig, guessed + rigs.remarks(rig, positions_ws, rotations_ws, stance)
 
 
 def _skating(

@@ -99,13 +99,12 @@ def find_subject(names: tuple[str, ...]) -> Subject | None:
     for name in names:
         prefix, _, label = name.rpartition(":")
         subjects.setdefault(prefix, {})[label.strip().upper()] = name
-    complete = [subject for own in subjects.values() if (subject := _subject(own))]
-    if len(complete) > 1:
-        wearers = [prefix for prefix, own in subjects.items() if _subject(own)]
+    wearers = {prefix: subject for prefix, own in subjects.items() if (subject := _subject(own))}
+    if len(wearers) > 1:
         raise ValueError(
-            f"{len(complete)} subjects wear Plug-in Gait markers, {wearers}; name those of one"
+            f"{len(wearers)} subjects wear Plug-in Gait markers, {list(wearers)}; name those of one"
         )
-    return complete[0] if complete else None
+    return next(iter(wearers.values()), None)
 
 
 def _subject(names: Mapping[str, str]) -> Subject | None:
