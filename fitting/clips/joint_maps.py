@@ -384,8 +384,8 @@ def template(names: tuple[str, ...], parents: tuple[int, ...], source: str) -> s
     depth = {-1: 0}
     for joint, parent in enumerate(parents):
         depth[joint] = depth[parent] + 1
-    tree = [f"#{'  ' * depth[joint]}{_shown(name)}" for joint, name in enumerate(names)]
-    head = HEAD.format(source=_shown(source), state=GUESSED if match is None else KNOWN)
+    tree = [f"#{'  ' * depth[joint]}{_printable(name)}" for joint, name in enumerate(names)]
+    head = HEAD.format(source=_printable(source), state=GUESSED if match is None else KNOWN)
     return f"{head}\n{tomli_w.dumps(roles)}{TAIL}" + "\n".join(tree)
 
 
@@ -397,8 +397,8 @@ def marker_template(names: tuple[str, ...], roles: dict[str, str], source: str) 
         roles: "" where nothing is guessed.
         source: name of the clip.
     """
-    head = HEAD.format(source=_shown(source), state=GUESSED)
-    markers = "\n".join(f"#{_shown(name)}" for name in names)
+    head = HEAD.format(source=_printable(source), state=GUESSED)
+    markers = "\n".join(f"#{_printable(name)}" for name in names)
     return f"{head}\n{tomli_w.dumps(roles)}{MARKER_TAIL}{markers}"
 
 
@@ -449,6 +449,6 @@ def _has_side(name: str, letter: str, side: str) -> bool:
     return bool(re.search(rf"{alone}|^{letter}(?=[A-Z])|(?<=[a-z]){capital}$", name))
 
 
-def _shown(name: str) -> str:
+def _printable(name: str) -> str:
     """A name as a comment can hold it."""
     return name if name.isprintable() else ascii(name)

@@ -81,7 +81,7 @@ class Viewer:
         self._player = Player(clip.seconds, self._draw_time)
         self._latest = Latest(self._solve)
         self._connect()
-        self._latest.ask()
+        self._latest.request()
 
     def _build_panel(self) -> None:
         gui, clip = self.server.gui, self.solver.animation.placed_clip
@@ -151,7 +151,7 @@ class Viewer:
                 self.tuning.change(ik, slider.name, time.monotonic())
         except ValueError as error:
             self._history.message.content = literal(str(error))
-        self._latest.ask()
+        self._latest.request()
 
     def _step(self, way: str) -> None:
         with self._lock:
@@ -160,7 +160,7 @@ class Viewer:
 
     def _moved(self) -> None:
         self._sliders.follow(self.tuning.ik)
-        self._latest.ask()
+        self._latest.request()
 
     def _solve(self) -> None:
         with self._lock:
@@ -175,7 +175,7 @@ class Viewer:
             self._history.cost.content = f"**{literal(str(error))}**"
             return
         if solver is not self.solver:
-            return  # another clip was chosen meanwhile, and has asked, too
+            return  # another clip was chosen meanwhile, which requests its own solution
         self.solved = solved
         figure.show(solved)
         self._update_layers()
@@ -209,7 +209,7 @@ class Viewer:
             self._player.seconds = clip.seconds
             self._time.frame.max = max(clip.frame_count - 1, 1)
             self._seek(0)
-        self._latest.ask()
+        self._latest.request()
 
 
 class Figure:
@@ -423,7 +423,7 @@ def _callback(
     slider: Slider, handle: viser.GuiInputHandle, moved: Moved
 ) -> Callable[[viser.GuiEvent], None]:
     def on_update(event: viser.GuiEvent) -> None:
-        if event.client is not None:  # else the page was moved, and not by a user
+        if event.client is not None:  # otherwise the program moved it, not a user
             moved(slider, handle.value)
 
     return on_update
@@ -507,44 +507,44 @@ def _cost(solved: Solved, costs: Mapping[str, float]) -> str:
 
 
 class Latest:
-    """Does some work whenever it was asked for since it last began; requests do not queue up.
+    """Does some work again whenever it is requested; requests do not queue up.
 
     Args:
-        work: what to do; it looks up by itself what is newest.
+        work: what to do; it reads by itself what is newest.
     """
 
     def __init__(self, work: Callable[[], object]):
         self.work = work
-        self._asked = self._closed = self._busy = False
+        self._requested = self._closed = self._busy = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="jaxik view: solver", daemon=True)
         self._thread.start()
 
-    def ask(self) -> None:
-        """Asks for the work to be done, and returns at once."""
+    def request(self) -> None:
+        """Requests the work, and returns at once."""
         with self._changed:
-            self._asked = True
+            self._requested = True
             self._changed.notify_all()
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Waits until all that was asked for is done; False if that takes longer."""
+        """Waits until all that was requested is done; False if that takes longer."""
         with self._changed:
-            return self._changed.wait_for(lambda: not (self._asked or self._busy), seconds)
+            return self._changed.wait_for(lambda: not (self._requested or self._busy), seconds)
 
     def close(self) -> None:
         """Ends the thread, after the work that it is doing."""
         with self._changed:
-            self._closed, self._asked = True, False
+            self._closed, self._requested = True, False
             self._changed.notify_all()
         self._thread.join()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._asked or self._closed)
+                self._changed.wait_for(lambda: self._requested or self._closed)
                 if self._closed:
                     return
-                self._asked, self._busy = False, True
+                self._requested, self._busy = False, True
             try:
                 self.work()
             except Exception:  # the next request may do better

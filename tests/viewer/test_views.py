@@ -144,11 +144,11 @@ def test_only_the_newest_request_is_worked_on():
         done.append(value)
 
     latest = Latest(work)
-    latest.ask()
+    latest.request()
     assert began.wait(10)
     for value in range(1, 50):
         newest[0] = value
-        latest.ask()
+        latest.request()
     go_on.set()
     assert latest.wait(10)
     latest.close()
