@@ -561,39 +561,31 @@ def _time_cold_fits(measurement: Measurement, sizes: Sizes) -> None:
                     cold_fit = functools.partial(
                         call_in_process, processes.fit_once, folder, environment=environment
                     )
-                    seconds, cpu_seconds = time_calls(lambda: searches.append(cold_fit()))  # noqa: B023
-                    measurement.samples.setdefault(name, []).append(seconds)
-                    measurement.busy.setdefault(name, []).append(cpu_seconds)
-                    search = f"its search, {state} cache"
-                    measurement.samples.setdefault(search, []).append(searches[-1])
+                    times = time_calls(lambda: searches.append(cold_fit()))  # noqa: B023
+                    measurement.add_sample(name, *times)
+                    measurement.add_sample(f"its search, {state} cache", searches[-1])
 
 
 def first(measurement: Measurement, sizes: Sizes) -> None:
-    """Processes that begin with an empty cache and with a full one."""
+    """Processes that begin with an empty cache and with a full one, imports included."""
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     for number in range(sizes.fits):
         with tempfile.TemporaryDirectory() as parent:
             exports.copy(processes.EXAMPLE, folder := Path(parent, processes.EXAMPLE), "{}")
-            for state in ENDS:
-                for kind in WAITS:
-                    name = f"{kind}, {state} cache"
-                    measurement.progress(f"first: {name}, run {number + 1} of {sizes.fits}")
-                    seconds = _in_process(kind, folder, {"XDG_CACHE_HOME": f"{parent}/{kind}"})
-                    measurement.samples.setdefault(name, []).append(seconds["first"])
-                    if kind == "fit":
-                        measurement.samples.setdefault(f"whole {name}", []).append(seconds["end"])
+            for state, kind in itertools.product(ENDS, WAITS):
+                name = f"{kind}, {state} cache"
+                measurement.progress(f"first: {name}, run {number + 1} of {sizes.fits}")
+                environment = variables | {"XDG_CACHE_HOME": f"{parent}/{kind}"}
+                start = time.time()
+                first = call_in_process(processes.wait, kind, str(folder), environment=environment)
+                measurement.add_sample(name, first - start)
+                if kind == "fit":
+                    measurement.add_sample(f"whole {name}", time.time() - start)
     for state, at_most in ENDS.items():
         for kind, what in WAITS.items():
             measurement.add_timing(f"{kind}, {state} cache", f"{what}, {state} cache")
         what = f"… the whole fit, {state} cache"
         measurement.add_timing(f"whole fit, {state} cache", what, at_most=at_most)
-
-
-def _in_process(kind: str, folder: Path, variables: dict[str, str]) -> dict[str, float]:
-    """Seconds of a new process until its first number and its end, imports included."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | variables
-    start = time.time()
-    first = call_in_process(processes.wait, kind, str(folder), environment=environment)
-    return {"first": first - start, "end": time.time() - start}
 
 
 def posterior(measurement: Measurement, sizes: Sizes) -> None:

@@ -135,13 +135,13 @@ class Measurement:
     """Duration of the whole benchmark."""
 
     def progress(self, text: str) -> None:
-        """Says what is being done."""
+        """Reports what is being done."""
         activity.report(text, text)
 
     def compile(
         self, name: str, function: Callable, *arguments: PyTree, sparse: PyTree = ()
     ) -> Callable:
-        """The function compiled for these arguments; keeps its compile time and its work by name.
+        """The function compiled for these arguments; stores its compile time and its work by name.
 
         A run reads little of the arrays that are `sparse`; see `work_of_program`.
         """
@@ -225,6 +225,12 @@ class Measurement:
         self.samples |= samples
         self.busy |= busy
         return medians(samples)
+
+    def add_sample(self, name: str, seconds: float, cpu_seconds: float | None = None) -> None:
+        """Adds a sample of a call that was not timed in turns."""
+        self.samples.setdefault(name, []).append(seconds)
+        if cpu_seconds is not None:
+            self.busy.setdefault(name, []).append(cpu_seconds)
 
     def add(self, what: str, value: float, unit: str, **rest: Any) -> None:
         """Adds a figure; `rest` are further fields of it."""
@@ -386,7 +392,7 @@ def run_benchmarks(
     quick: bool,
     announce: Callable[[str], None],
 ) -> Report:
-    """Measures benchmarks one after another; an interrupt ends it and keeps what was measured.
+    """Measures benchmarks one after another; an interrupt ends it; what was measured stays.
 
     `announce` gets a line at the start and at the end of each.
     """
