@@ -10,6 +10,7 @@ may have metadata that say by which name earlier releases wrote it.
 """
 
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -31,7 +32,7 @@ from typing import (
 )
 
 from . import files
-from .declarations import BOOLEAN, Constraint, one_of
+from .declarations import BOOLEAN, Constraint
 from .validation import Table, in_one_line, read_json
 
 FORMAT = "format"  # key of the version
@@ -153,9 +154,11 @@ class _Check:
     essential: Set[str] | None
 
     def check(self, value: Any, declared: Any, where: str) -> Any:
-        origin, arguments = get_origin(declared), get_args(declared)
         if declared is Any:
             return value
+        if (plain := PLAIN.get(declared)) is not None:
+            return plain.convert(_wanted(plain.accepts(value), value, plain.description, where))
+        origin, arguments = get_origin(declared), get_args(declared)
         if origin is Annotated:
             return self._constrained(value, arguments[0], arguments[1:], where)
         if origin is NotRequired:
@@ -164,10 +167,9 @@ class _Check:
             return self._any_of(value, arguments, where)
         if is_typeddict(declared) or dataclasses.is_dataclass(declared):
             return self._table(value, declared, where)
-        plain = one_of(arguments) if origin is Literal else PLAIN.get(declared)
-        if plain is None:
-            return self._collection(value, origin or declared, arguments, where)
-        return plain.convert(_wanted(plain.accepts(value), value, plain.description, where))
+        if origin is Literal:
+            return _wanted(value in arguments, value, f"one of {list(arguments)}", where)
+        return self._collection(value, origin or declared, arguments, where)
 
     def _constrained(self, value: Any, declared: Any, constraints: tuple, where: str) -> Any:
         value = self.check(value, declared, where)
@@ -189,7 +191,7 @@ class _Check:
 
     def _table(self, value: Any, declared: Any, where: str) -> Any:
         _wanted(isinstance(value, Mapping), value, "a table", where)
-        hints = get_type_hints(declared, include_extras=True)
+        hints = _hints(declared)
         if is_typeddict(declared):
             required = declared.__required_keys__
         else:
@@ -219,6 +221,11 @@ class _Check:
         _wanted(isinstance(value, list), value, "a list", where)
         declared = arguments[0] if arguments else Any
         return [self.check(entry, declared, f"{where}[{i}]") for i, entry in enumerate(value)]
+
+
+@functools.cache  # a fit's file has a thousand tables
+def _hints(declared: Any) -> dict[str, Any]:
+    return get_type_hints(declared, include_extras=True)
 
 
 def _inside(where: str, key: str) -> str:
