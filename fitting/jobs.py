@@ -21,10 +21,10 @@ from .studies.calibrate.wrong_model import calibrate_wrong_model as calibrate_wr
 from .studies.draft_report import init as init
 from .studies.exports import export as export
 from .studies.fit.fit_jobs import fit as fit
-from .studies.fit.fit_jobs import sample as sample
-from .studies.fit.fit_jobs import translate as translate
 from .studies.many.fit_many import fit_many as fit_many
 from .studies.population.population import population as population
 from .studies.sample.run_comparison import compare_runs as compare_runs
+from .studies.sample.sample_jobs import sample as sample
+from .studies.translation import translate as translate
 from .viewer.views import view as view
 from .viewer.views import view_run as view_run

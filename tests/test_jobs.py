@@ -39,7 +39,7 @@ from fitting.report import document, pages
 from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
 from fitting.studies.fit import assess, fit_jobs, fit_report, identifiability_report, run_folder
-from fitting.studies.sample import posterior_report, replay
+from fitting.studies.sample import posterior_report, replay, sample_jobs
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import CLIP, ROOT, write
@@ -248,13 +248,13 @@ def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(done, run):
 
 def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(run, monkeypatch):
     worse = worsen(run)
-    monkeypatch.setattr(fit_jobs, "assess_solution", interrupt)
+    monkeypatch.setattr(sample_jobs, "assess_solution", interrupt)
     fitting.sample(run)
     assert numbers_of(run) == worse and (run / run_folder.LOWER_POINT).is_file()
 
 
 def test_a_replay_that_is_interrupted_leaves_the_report_of_the_chain(done, run, monkeypatch):
-    monkeypatch.setattr(fit_jobs, "replay", interrupt)
+    monkeypatch.setattr(sample_jobs, "replay", interrupt)
     sampled = fitting.sample(dataclasses.replace(done.fitted, run=run))
     assert sampled.interrupted and (run / run_folder.POSTERIOR).is_file()
     assert "## Posterior" in (run / run_folder.SUMMARY).read_text()

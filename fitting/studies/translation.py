@@ -27,7 +27,7 @@ from fitting import clips
 from fitting.clips import clip_frames, edit
 from fitting.experiment import parameter_files, systems
 from fitting.experiment.experiment import ClipEntry, Experiment
-from fitting.experiment.problems import ClipData, problem_from_clips
+from fitting.experiment.problems import ClipData, load_known_values, problem_from_clips
 from fitting.ground.ground_path import place_root
 from fitting.inference import sensitivity
 from fitting.inference.noise import NoiseOptions
@@ -39,7 +39,7 @@ from fitting.motion.accuracy import NEGLIGIBLE, Difference, Remainder, summarise
 from fitting.problem.problem import Problem
 from fitting.problem.space import free_parameter
 from fitting.report import style
-from fitting.report.document import Block, Grid, Plot, Points, Section, Text
+from fitting.report.document import Block, Grid, Plot, Points, Section, Text, brief
 from fitting.report.formatting import DIFFERENCES, Table, number, percent
 from fitting.report.style import AFTER, BEFORE, EARTH, legend, styled
 from fitting.runtime import activity, files, validation
@@ -50,8 +50,10 @@ from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 
 from .animations import AnimationFiles, load_animation
-from .fit import fit_report, run_folder
+from .fit import fit_jobs, fit_report, run_folder
+from .fit.assess import assess_solution, search
 from .fit.fit import Fit
+from .output import log_output, output_folder
 
 # The source has no noise: these say how far apart two motions still count as the same.
 TOLERANCES = {
@@ -544,3 +546,57 @@ def _shade(axes: Axes, clip: Difference) -> None:
     edges = np.flatnonzero(np.diff(clip.standing.astype(int), prepend=0, append=0))
     for start, end in edges.reshape(-1, 2):
         axes.axvspan(float(clip.time[start]), float(clip.time[end - 1]), color=EARTH, zorder=0)
+
+
+@in_float64
+def translate(
+    request: TranslationRequest,
+    output: str | Path | None = None,
+) -> Fit:
+    """Fits the parameters of one system to the motion of another.
+
+    KeyboardInterrupt (Ctrl-C) ends the search, and a second call with the same folder goes on, as
+    in `fit`. The folder is a run: `sample` and `apply` take it.
+
+    Args:
+        request: which system is fitted to which, and on what.
+        output: a new folder for the run, or that of a translation that was killed or interrupted.
+
+    Raises:
+        ValueError: as `prepare`, or the folder holds something already.
+    """
+    run = None if output is None else Path(output)
+    if run is not None:
+        check_folder(run)
+    with output_folder(run):
+        prepared = prepare(request, Path() if run is None else run)
+        experiment, problem = prepared.experiment, prepared.problem
+        activity.log(
+            f"fitting {len(experiment.free)} parameters of {request.target.name} to "
+            f"{request.source.name} on {len(prepared.clips)} clip(s)"
+        )
+        start = starting_point(problem)
+        checkpoints = fit_jobs.open_checkpoints(run, experiment, problem)
+        with checkpoints:
+            solution = search(problem, experiment, start)
+            if solution.interrupted:
+                activity.log(fit_jobs.INTERRUPTED)
+            known = None
+            if run is not None:
+                save_source(run, prepared)
+                known = load_known_values(experiment, problem.space.system)
+            fitted = assess_solution(
+                experiment, problem, solution,
+                known_values=known, run=run, has_noise=False, clips=prepared.clips,
+            )  # fmt: skip
+            if run is not None:
+                run_folder.save_fit(run, fitted)
+        remainders = differences(fitted)
+        if run is not None:
+            write(run, prepared, fitted, remainders)
+        if not fitted.solution.interrupted:
+            checkpoints.remove()
+        activity.log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+        activity.log(brief([opening(prepared, fitted, remainders)]))
+        log_output(run, run_folder.SUMMARY)
+        return fitted

@@ -38,7 +38,7 @@ from fitting.runtime import display
 from fitting.studies.fit import fit_report, goodness_report, identifiability_report, run_folder
 from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import posterior_plots, posterior_report
+from fitting.studies.sample import posterior_plots, posterior_report, sample_jobs
 from fitting.studies.sample.sample import SampledFit
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
@@ -351,7 +351,7 @@ def sampled_fit(fitted: Fit, posterior: Posterior, known: Any) -> SampledFit:
 
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> tuple[str, dict[str, Any]]:
     sampled = sampled_fit(fitted, posterior, fitted.known_values)
-    run_folder.save_posterior(run, sampled)
+    sample_jobs.save_posterior(run, sampled)
     written = run / posterior_report.write_posterior(run, sampled)
     return written.read_text(), json.loads((run / run_folder.POSTERIOR).read_text())
 

@@ -28,7 +28,7 @@ from fitting.motion.playback import ClipActivity
 from fitting.report.formatting import DIFFERENCES
 from fitting.studies import translation
 from fitting.studies.animations import Animation
-from fitting.studies.fit import fit_jobs, fit_report, run_folder
+from fitting.studies.fit import fit_report, run_folder
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
@@ -209,7 +209,7 @@ def test_only_parameters_that_move_the_clip_are_free_by_default(run):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [(clips, "save_clip"), (fit_jobs, "assess_solution")],
+    [(clips, "save_clip"), (translation, "assess_solution")],
     ids=["before its source", "before its profiles"],
 )
 def test_a_translation_that_dies_after_its_search_goes_on_in_its_folder(

@@ -1,7 +1,7 @@
 """The search of an experiment, and the assessment of its solution, which may meet a lower point."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from fitting.problem.scene import MEASURED
 from fitting.runtime import activity
 
 from .fit import Fit
+from .run_folder import save_solution
 
 MAX_RETURNS = 3  # to the search from lower points
 MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
@@ -82,7 +83,6 @@ def assess_solution(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     solution: Solution,
-    on_solution: Callable[[Solution], object] = lambda solution: None,
     *,
     known_values: Mapping[str, float] | None = None,
     run: Path | None = None,
@@ -95,9 +95,8 @@ def assess_solution(
         experiment: its settings of the search.
         problem: the problem of the experiment.
         solution: of the problem.
-        on_solution: called with each solution before its assessment, which may fail.
         known_values: as `Fit` has them, like what follows.
-        run: the folder where it is going to be written.
+        run: the folder where each solution is written before its assessment, which may fail.
         has_noise: whether the reference is captured.
         clips: of the problem.
 
@@ -106,7 +105,8 @@ def assess_solution(
     """
     left: list[float] = []
     while True:
-        on_solution(solution)
+        if run is not None:
+            save_solution(run, experiment, problem, solution)
         of_weight = solution.weighted(float(problem.weight))
         identifiability = assess_identifiability(problem, of_weight)
         if identifiability.improvement <= MIN_IMPROVEMENT or solution.interrupted:

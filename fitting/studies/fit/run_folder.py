@@ -16,13 +16,10 @@ Each file says in which format it is; one that does not is of an earlier release
 """
 
 import dataclasses
-import math
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 import jaxik
 from fitting.clips import save_clip
@@ -31,18 +28,13 @@ from fitting.experiment.experiment import Experiment
 from fitting.experiment.systems import Preset
 from fitting.inference.noise import NoiseModel, NoiseOptions
 from fitting.inference.optimise.solution import Solution
-from fitting.inference.sample import blocks, inference_data
-from fitting.inference.sample.blocks import LeaveOneOut
 from fitting.problem.capture_system import alone, is_of_capture
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.claimed_folder import LOCK
 from fitting.runtime.files import TEMPORARY, write_text
-from fitting.runtime.json_files import JsonFile, check_version, write_json
-from fitting.runtime.validation import Content, flatten, read_toml
-from fitting.studies.sample.predictive import Band, PredictiveCheck, Statistic
-from fitting.studies.sample.replay import Replay
-from fitting.studies.sample.sample import SampledFit
+from fitting.runtime.json_files import JsonFile, check_version
+from fitting.runtime.validation import flatten, read_toml
 
 from .fit import Fit, FitRecord
 from .fit_motions import saved_clips
@@ -60,8 +52,6 @@ FIT_FILE = JsonFile(
 )
 FORMAT = 1  # of the two TOML files, in their first line, which is a comment to other readers
 FORMAT_LINE = re.compile(r"# jaxik run, format (\w+)\n")
-
-STATISTICS = ("rms", "autocorrelation", "largest")
 
 
 def check_output_folder(folder: Path) -> None:
@@ -103,7 +93,7 @@ def save_solution(
     run.mkdir(parents=True, exist_ok=True)
     for name in (FIT, FITTED_PARAMETERS):
         (run / name).unlink(missing_ok=True)
-    _write_toml(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
+    write_toml(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
     _write_system(run / PARAMETERS, experiment, problem, alone(problem.space.unpack(solution.u)))
 
 
@@ -112,7 +102,7 @@ def _write_system(
 ) -> None:
     preset = Preset(experiment.preset, experiment.faithful)
     leg_length = experiment.leg_length(problem.data[0].rig)
-    _write_toml(path, parameter_files.system_to_toml(ik, preset, leg_length))
+    write_toml(path, parameter_files.system_to_toml(ik, preset, leg_length))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:
@@ -213,7 +203,8 @@ def _check_numbers(summary: FitRecord) -> None:
                 )
 
 
-def _write_toml(path: Path, text: str) -> None:
+def write_toml(path: Path, text: str) -> None:
+    """Writes a TOML file of a run, which says its format."""
     write_text(path, f"# jaxik run, format {FORMAT}\n{text}")
 
 
@@ -224,104 +215,3 @@ def _check_toml_format(path: Path) -> None:
     if version is not None:
         number = version[1]
         check_version(path, int(number) if number.isdecimal() else number, FORMAT)
-
-
-@activity.announced("Writing the posterior")
-def save_posterior(run: Path, sampled: SampledFit) -> None:
-    """Writes the summary of a posterior, and of what it makes of the prior, beside its chain."""
-    posterior = sampled.posterior
-    of_prior = {
-        name: {"prior": prior, "prior_sensitivity": sampled.prior_sensitivity[name]}
-        for name, prior in sampled.priors.items()
-    }
-    lower = {"gain": posterior.improvement, "values": posterior.best_values}
-    numbers = {
-        "converged": posterior.converged,
-        "message": posterior.message,
-        "steps": len(posterior.u) * posterior.thin_by,
-        "walkers": posterior.u.shape[1],
-        "burn_in": posterior.burn_in * posterior.thin_by,
-        "autocorrelation_time": posterior.autocorrelation_time.tolist(),
-        "acceptance": float(posterior.acceptance.mean()),
-        "stuck": posterior.stuck,
-        "left_out": {"walkers": posterior.isolated, "weight": posterior.isolated_mass},
-        "islands": [
-            {
-                "weight": mode.weight,
-                "error": mode.error if mode.is_weighed else None,
-                "exchanges": mode.exchanges,
-                "walkers": mode.walkers,
-                "log_probability": mode.log_probability,
-            }
-            for mode in posterior.modes
-        ],
-        "seconds": posterior.seconds,
-        "lower_point": lower if sampled.has_lower_point else None,
-        "disagreements": sampled.disagreements,
-        **summarise_replay(sampled.replay, sampled.left_out),
-        "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
-        "sigmas": {
-            kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
-            for kind, draws in posterior.sigmas.items()
-        },
-    }
-    write_json(run / POSTERIOR, numbers)
-    (run / LOWER_POINT).unlink(missing_ok=True)
-    if sampled.has_lower_point:
-        begun_there = dataclasses.replace(sampled.experiment, start=posterior.best_values)
-        _write_toml(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
-    if blocks.is_available():
-        inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)
-
-
-def summarise_replay(replay: Replay | None, left_out: LeaveOneOut | None) -> Content:
-    """Predictive checks and leave-one-out; None where there are none."""
-    if replay is None:
-        return {"predictive_checks": None, "leave_one_out": None}
-    pairs = zip(replay.checks, replay.bands, strict=True)
-    return {
-        "predictive_checks": [_check(check, band) for check, band in pairs],
-        "leave_one_out": None if left_out is None else _left_out(left_out, replay),
-    }
-
-
-def _check(check: PredictiveCheck, band: Band) -> Content:
-    statistics = {name: _statistic(getattr(check, name)) for name in STATISTICS}
-    return {
-        "clip": check.clip + 1,
-        "kind": check.kind,
-        **statistics,
-        "outside_band": band.outside,
-        "surprises": check.surprises,
-    }
-
-
-def _statistic(statistic: Statistic) -> Content:
-    """Medians over the draws, and the posterior predictive p-value."""
-    return {
-        "captured": statistic.median,
-        "replicated": list(statistic.replicated_interval),
-        "p": statistic.p,
-    }
-
-
-def _left_out(found: LeaveOneOut, replay: Replay) -> Content:
-    blocks = replay.blocks
-    columns = (blocks.clip, blocks.start, blocks.end, found.elpd_of_block)
-    names = ("clip", "start", "end", "elpd", "pareto_k")
-    shapes = map(_finite, found.pareto_k.tolist())
-    rows = zip(*(column.tolist() for column in columns), shapes, strict=True)
-    return {
-        "elpd": found.elpd,
-        "error": found.error,
-        "parameters": found.parameters,
-        "max_k": found.max_k,
-        "neighbours": _finite(found.neighbours),
-        "data": blocks.data,
-        "blocks": [dict(zip(names, row, strict=True)) for row in rows],
-    }
-
-
-def _finite(value: float) -> float | None:
-    """None for what JSON does not have."""
-    return value if math.isfinite(value) else None

@@ -2,5 +2,5 @@
 
 `sample` draws it, `replay` plays draws again, `predictive` compares them with the capture,
 `run_comparison` compares sampled runs of several systems. `posterior_report` and `posterior_plots`
-say and show it.
+say and show it. `sample_jobs` has `sample` as the user calls it.
 """
