@@ -12,19 +12,19 @@ Each job stands with its study in `fitting.studies`; `view` and `view_run` stand
 """
 
 from .studies.ablation import ablate as ablate
-from .studies.animation_jobs import apply as apply
-from .studies.animation_jobs import compare as compare
-from .studies.animation_jobs import run_suite as run_suite
-from .studies.animation_jobs import solve as solve
+from .studies.animations import apply as apply
+from .studies.animations import solve as solve
 from .studies.calibrate.calibration import calibrate as calibrate
 from .studies.calibrate.wrong_model import calibrate_wrong_model as calibrate_wrong_model
-from .studies.draft_report import init as init
+from .studies.comparison import compare as compare
+from .studies.draft import init as init
 from .studies.exports import export as export
 from .studies.fit.fit_jobs import fit as fit
 from .studies.many.fit_many import fit_many as fit_many
-from .studies.population.population import population as population
+from .studies.population import population as population
 from .studies.sample.run_comparison import compare_runs as compare_runs
 from .studies.sample.sample_jobs import sample as sample
+from .studies.suite import run_suite as run_suite
 from .studies.translation import translate as translate
 from .viewer.views import view as view
 from .viewer.views import view_run as view_run

@@ -11,6 +11,7 @@ keeps it with the asset.
 import dataclasses
 import json
 import math
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,18 +24,19 @@ import numpy as np
 from jaxtyping import Float64
 
 import jaxik
-from fitting.clips import Clip, load_clip
+from fitting.clips import Clip, flight, load_clip, save_clip
 from fitting.clips.clip_frames import clip_from_result, frames_from_clip, positions_by_role, raised
 from fitting.clips.edit import at_speed
 from fitting.clips.formats.npz import holds_base
+from fitting.clips.formats.saving import check_clip_file
 from fitting.clips.joint_maps import find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
 from fitting.ground import coverage
 from fitting.ground.coverage import Coverage
 from fitting.ground.ground_path import AS_ANIMATED, Root, RootChoice, place_root
-from fitting.ground.meshes import TerrainOptions
-from fitting.motion import measures
+from fitting.ground.meshes import TerrainOptions, mesh_of
+from fitting.motion import accuracy, measures
 from fitting.motion.flat_animation import (
     load_flat_animation,
     with_cut_off_swings,
@@ -50,12 +52,15 @@ from fitting.motion.measures import (
     place,
 )
 from fitting.motion.playback import stage_outputs
+from fitting.report.formatting import aligned, figures_table, joined
 from fitting.runtime import activity, program_cache
-from fitting.runtime.precision import in_float64
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
+
+from .fit import run_folder
 
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
@@ -438,3 +443,82 @@ def warning_texts(
     elif math.isnan(measured.contact):
         texts.append("no foot of the animation ever stands; see its contacts with `jaxik inspect`")
     return texts
+
+
+@in_float64
+def apply(
+    run: str | Path,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    with_terrain: bool = False,
+) -> Clip:
+    """Solves a flat animation with the fitted system of a run; see `solve`.
+
+    Raises:
+        ValueError: as `solve`, or the folder holds no finished fit.
+    """
+    ik = run_folder.load_fitted_system(Path(run), animation.flat_clip.rig)
+    return solve(ik, animation, output, with_terrain=with_terrain)
+
+
+@in_float64
+def solve(
+    ik: jaxik.FootIK,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    with_terrain: bool = False,
+) -> Clip:
+    """Solves a flat animation, and measures how its feet are placed on the ground.
+
+    Where a captured motion is known, the log also shows the difference. What is beyond its bound is
+    a warning, with the most likely cause of feet off the ground.
+
+    Args:
+        ik: the system.
+        animation: the clip, the terrain, and where the root is put.
+        output: .npz, .bvh, .glb or .csv file for the solved clip; see `save_clip`.
+        with_terrain: whether a .glb gets the terrain beside the skeleton.
+
+    Raises:
+        ValueError: a file cannot be read or written, or the system does not fit the clip or gives
+            poses that are not finite.
+    """
+    path = None if output is None else Path(output)
+    if path is not None:
+        check_clip_file(path, with_ground=with_terrain)
+        if path.exists() and path.samefile(animation.clip):
+            raise ValueError(f"{path}: is the clip that is read; name another file")
+    ik, loaded = with_floats(ik, np.float64), load_animation(animation)
+    if path is not None:
+        check_clip_file(path, loaded.clip)
+    loaded.check_shapes(ik)
+    began = time.perf_counter()
+    with activity.announced("Compiling and running the system"):
+        result, solved = loaded.solve(ik)
+    seconds = time.perf_counter() - began
+    with activity.announced("Measuring how the feet are placed"):
+        motion = loaded.place(solved, result)
+        cause = loaded.cause(motion)
+    if path is not None:
+        joints = arrays(motion)
+        ground = mesh_of(loaded.terrain) if with_terrain else None
+        save_clip(path, solved, joints=joints, ground=ground)
+    written = "" if path is None else f"; written to {path}"
+    activity.log(f"{solved.frame_count} frames in {seconds:.1f} s{written}")
+    where = [
+        f"root: {loaded.root.reason}",
+        flight.describe(loaded.clip),
+        trunk_text(result, solved),
+        *(f"note: {remark}" for remark in loaded.clip.remarks),
+    ]
+    table = figures_table("feet on the ground", {"solved": motion.measures})
+    activity.log(joined([*filter(None, where), "", aligned(table)]))
+    if loaded.captured is not None:
+        errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
+        accuracies = {"solved": accuracy.summarise([errors])}
+        table = figures_table("difference from the captured motion", accuracies)
+        activity.log(joined(["", aligned(table)]))
+    warn(motion.measures, loaded.bounds, cause)
+    return solved

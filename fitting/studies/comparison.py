@@ -1,40 +1,98 @@
-"""Several systems on one flat animation, measured side by side."""
+"""Several systems on one flat animation, measured side by side: the job, and its report."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 import jaxik
+from fitting.clips import flight
 from fitting.experiment.parameter_files import load_system
 from fitting.experiment.systems import preset_system
+from fitting.ground import ground_path
 from fitting.motion import accuracy
 from fitting.motion.accuracy import Accuracy
 from fitting.motion.measures import (
+    BOUNDED,
     MEASURES,
     Bounded,
     Cause,
+    Measures,
     PlacedMotion,
     Soles,
     with_soles_of,
 )
 from fitting.motion.worst_window import SECONDS, window_sums
+from fitting.report import motion_data
+from fitting.report.document import (
+    Block,
+    Document,
+    Finding,
+    Grid,
+    Jump,
+    Plot,
+    Points,
+    Section,
+    Terms,
+    Text,
+    View,
+)
+from fitting.report.formatting import Table, figures_table, listed, meanings, percent, transposed
+from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
+from fitting.report.style import (
+    BEFORE,
+    CAPTURED,
+    EARTH,
+    GROUND,
+    STAGES,
+    earth,
+    legend,
+    styled,
+    whole_and_part,
+)
 from fitting.runtime import activity
 from fitting.runtime.display import Shown, data_frame
-from fitting.runtime.precision import in_float64
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 
-from .animations import Animation, RateDifference
+from . import animations
+from .animations import JOINTS, Animation, RateDifference
 from .fit.run_folder import PARAMETERS
+from .output import output_folder, publish
 
 if TYPE_CHECKING:
     import pandas
 
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
+
+TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
+RATES = (
+    "How far joints are from where they are at the clip's own rate: rms over frames and legs, and "
+    "the largest distance. Labels, strides, speeds and root stay those at the clip's own rate, as "
+    "a game keeps them with the animation. Pelvis and feet of `unreal` and the pelvis of `mec` "
+    "follow by the engine's interp-to, whose half-life depends on the frame rate, as in the "
+    "originals: at a speed of 15 it is 33 ms at 30 Hz and 40 ms at 60 Hz."
+)
+
+COLOURS = (*STAGES, CAPTURED)
+Dashes: TypeAlias = Literal["-", "--", ":"]
+DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
+BAR_PANELS = 4  # in a row
+
+RADIUS = 0.018  # m, of the bones of a system
+CAPTURE = "captured"  # key of the captured motion, which no system has
+UNKNOWN = Bounded("", 0.0, "nothing is known of its feet")
+MARKED = "What is marked (!) is beyond its bound."
+BOUND, MISS = "bound", "!"  # a row of tables, and the mark of what is beyond it
 
 
 @dataclass(frozen=True)
@@ -165,7 +223,7 @@ def _file_names(paths: Sequence[Path]) -> dict[Path, str]:
     return names
 
 
-def compare(
+def run_systems(
     systems: Mapping[str, jaxik.FootIK],
     animation: Animation,
     *,
@@ -221,3 +279,458 @@ def worst_seconds(feet: Soles, fps: float) -> tuple[int, int]:
     frames = min(len(off), round(SECONDS * fps) + 1)
     start = int(np.argmax(window_sums(off, frames)))
     return start, start + frames - 1
+
+
+def rows(comparison: Comparison, names: Sequence[str]) -> Table:
+    """The bounds, and these measures of all systems, with marks; a row each, its name first."""
+    bounds = comparison.bounds
+    limits = [MEASURES[name].limit(bounds[name]) if name in bounds else "" for name in names]
+    made = [[system, *_cells(comparison, system, names)] for system in comparison.motions]
+    failed = [[system, *[f"none{MISS}" for _ in names]] for system in comparison.failures]
+    return [[BOUND, *limits], *made, *failed]
+
+
+def _cells(comparison: Comparison, system: str, names: Sequence[str]) -> list[str]:
+    measured = comparison.motions[system].measures
+    beyond = {b.name for b in measured.against(comparison.bounds) if b.is_beyond}
+    return [
+        MEASURES[name].format(getattr(measured, name)) + (MISS if name in beyond else "")
+        for name in names
+    ]
+
+
+def reasons(names: Iterable[str] = BOUNDED) -> list[str]:
+    """The bounds of measures with their reasons, a sentence each."""
+    return [
+        f"{measure.heading} {measure.limit(measure.bound)} {measure.unit}: {measure.reason}"
+        for measure in map(MEASURES.__getitem__, names)
+    ]
+
+
+def rate_table(comparison: Comparison) -> Table:
+    """How far each system is from its motion at the clip's rate, rms and largest, in mm."""
+    heading = [f"mm from {comparison.animation.clip.fps:g} Hz", "at", *JOINTS, "largest"]
+    return [heading] + [
+        [row.system, f"{row.fps:g} Hz"]
+        + [f"{1000 * row.rms[joint]:.1f}" for joint in JOINTS]
+        + [f"{1000 * max(row.largest.values()):.1f}"]
+        for row in comparison.rates
+    ]
+
+
+def numbers(comparison: Comparison) -> dict[str, Any]:
+    """The content of compare.json: SI units, radians and fractions of 1; null for NaN."""
+    animation = comparison.animation
+    return {
+        "title": comparison.title,
+        "frames": animation.clip.frame_count,
+        "fps": animation.clip.fps,
+        "root": animation.root.reason,
+        "bounds": comparison.bounds,
+        "systems": [
+            {"name": name, **motion.measures.numbers()}
+            | {"beyond": [b.name for b in comparison.against(name) if b.is_beyond]}
+            | {"cause": cause.kind if (cause := comparison.causes.get(name)) else None}
+            for name, motion in comparison.motions.items()
+        ],
+        "failures": dict(comparison.failures),
+        "rates": [asdict(row) for row in comparison.rates],
+    }
+
+
+class LineStyle(TypedDict):
+    """How a system is drawn, as keywords of `Axes.plot`."""
+
+    color: str
+    linestyle: Dashes
+    linewidth: float
+
+
+@styled
+def overview(comparison: Comparison) -> Figure:
+    """Heights of ankles and pelvis under every system, with the ground, and bars of measures."""
+    styles = _line_styles(comparison.motions)
+    legs = comparison.animation.clip.rig.names
+    bar_rows = -(-len(MEASURES) // BAR_PANELS)
+    heights = 3.4 * (len(legs) + 1) + 0.6, bar_rows * (0.42 * len(styles) + 1.0)
+    figure = Figure(figsize=(17, sum(heights) + 1.6), layout="constrained")
+    figure.suptitle(comparison.title)
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
+    _draw_heights(upper, comparison, styles)
+    grid = lower.subplots(bar_rows, BAR_PANELS, squeeze=False, sharey=True)
+    measured = {name: motion.measures for name, motion in comparison.motions.items()}
+    for axes, key in zip(grid.flat, MEASURES, strict=False):
+        _bars(axes, key, measured, styles)
+    lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
+    legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
+    return figure
+
+
+def _draw_heights(
+    figure: FigureBase, comparison: Comparison, styles: Mapping[str, LineStyle]
+) -> None:
+    """Heights over time, a panel for each leg and one for the pelvis."""
+    ground, clip = comparison.animated.soles.ground[..., 0], comparison.animated.clip
+    time = np.arange(clip.frame_count) / clip.fps
+    clips = {name: motion.clip for name, motion in comparison.motions.items()}
+    pelvises = {name: own.positions_ws[:, own.rig.pelvis, 1] for name, own in clips.items()}
+    pelvis = np.mean(list(pelvises.values()), axis=0)
+    columns = whole_and_part(figure, time, pelvis, len(clip.rig.names) + 1)
+    for panels in columns:
+        for leg, (axes, name) in enumerate(zip(panels, clip.rig.names, strict=False)):
+            for system, own in clips.items():
+                axes.plot(time, 100 * own.joints_ws(2)[:, leg, 1], **styles[system])
+            earth(axes, time, 100 * ground[:, leg])
+            axes.set_title(f"{_title(name)} ankle, with the ground under the animated one")
+        for system, heights in pelvises.items():
+            panels[-1].plot(time, 100 * heights, **styles[system])
+        earth(panels[-1], time, 100 * ground.mean(axis=1))
+        panels[-1].set_title("Pelvis, with the mean ground under the animated feet")
+    for axes in columns[0]:
+        axes.set_ylabel("height, cm")
+
+
+def _line_styles(systems: Iterable[str]) -> dict[str, LineStyle]:
+    """Line styles by system; the first one, which is the animation, is grey.
+
+    Each line is thinner than the one drawn before it, so that both are visible where they coincide.
+    """
+    first, *others = systems
+    styles: dict[str, LineStyle] = {first: {"color": BEFORE, "linestyle": "-", "linewidth": 3.5}}
+    for index, name in enumerate(others):
+        repeat, colour = divmod(index, len(COLOURS))
+        dashes = DASHES[repeat % len(DASHES)]
+        width = max(1.1, 2.6 - 0.4 * index)
+        styles[name] = {"color": COLOURS[colour], "linestyle": dashes, "linewidth": width}
+    return styles
+
+
+def _title(name: str) -> str:
+    """The name of a leg at the beginning of a title."""
+    return name.replace("_", " ").capitalize()
+
+
+def _bars(
+    axes: Axes, key: str, measures: Mapping[str, Measures], styles: Mapping[str, LineStyle]
+) -> None:
+    """One measure of all systems, with the value at the end of each bar."""
+    values = [getattr(measured, key) for measured in measures.values()]
+    widths = MEASURES[key].factor * np.nan_to_num(values)
+    rows = np.arange(len(values))
+    axes.barh(rows, widths, color=[styles[name]["color"] for name in measures], height=0.7)
+    for row, width, value in zip(rows, widths, values, strict=True):
+        axes.annotate(
+            MEASURES[key].format(value),
+            (width, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+        )
+    smallest = 10.0 ** (
+        1 - MEASURES[key].digits
+    )  # smallest axis: a value that rounds to 0 looks like 0
+    axes.set_xlim(0.0, 1.35 * max(*widths, smallest))
+    axes.xaxis.set_visible(False)  # the values are at the bars
+    axes.spines["bottom"].set_visible(False)
+    axes.set_ylim(len(values) - 0.4, -0.6)
+    axes.set_yticks(rows, list(measures))
+    axes.tick_params(axis="y", length=0)
+    axes.grid(False)
+    axes.set_title(MEASURES[key].title.capitalize())
+
+
+@in_float64
+def document(comparison: Comparison) -> Document:
+    """What a comparison says."""
+    systems = comparison.systems
+    failing = beyond(comparison)
+    measures = list(MEASURES)
+    titles = ["", *(measure.title for measure in MEASURES.values())]
+    visible = comparison.animated.measures.visible
+    caption = "Feet and pelvis over the ground, and the measures"
+    return Document(
+        file=TABLE,
+        kind="Foot IK systems compared on one clip",
+        title=comparison.title,
+        verdict=f"{len(failing)} of {len(systems)} beyond a bound"
+        if failing
+        else "All within bounds",
+        good=not failing,
+        findings=findings(comparison),
+        sections=[
+            Section(
+                "Measures",
+                [
+                    Text(MARKED),
+                    Grid(transposed([titles, *rows(comparison, measures)]), "Measures"),
+                    Plot(FIGURE, caption, lambda: overview(comparison)),
+                    Terms(meanings(MEASURES)),
+                    Text(
+                        f"`{ANIMATED}` is the animation without foot IK. A foot stands where the "
+                        "animation says so: by its contact labels or, without them, by its motion."
+                    ),
+                ],
+            ),
+            Section("Bounds", [Points(reasons(comparison.bounds))]),
+            Section(
+                "Beside the captured motion",
+                [
+                    Grid(figures_table("difference", comparison.accuracy), "Accuracy", brief=False),
+                    Text("Distances and angles are root mean squares."),
+                ]
+                if comparison.accuracy
+                else [],
+            ),
+            Section(
+                "At other frame rates",
+                [Text(RATES), Grid(rate_table(comparison), "Motion at other frame rates")]
+                if comparison.rates
+                else [],
+            ),
+            _worst(comparison),
+            _limits(comparison),
+        ],
+        asked=_asked(comparison),
+        numbers={NUMBERS: numbers(comparison)},
+        view=View(
+            [shown(comparison, systems, watched=_worst_system(comparison))],
+            [comparison.title],
+            f"{100 * visible:.2g} cm",
+        ),
+    )
+
+
+def _worst(comparison: Comparison) -> Section:
+    """The worst seconds of each system, and what is beyond its bounds or nearest to one."""
+    blocks: list[Block] = []
+    for name in comparison.systems:
+        start, end = _window(comparison, name)
+        fps = comparison.animation.clip.fps
+        worst, *others = comparison.against(name) or [UNKNOWN]
+        words = [worst.words, *(other.words for other in others if other.is_beyond)]
+        text = f"`{name}`, {start / fps:.2f} to {end / fps:.2f} s. In the whole clip: "
+        blocks += [
+            Text(f"{text}{'; '.join(words)}."),
+            Jump(f"Show {name} in the view", 0, key(name)),
+        ]
+    return Section("The worst two seconds of each system", blocks)
+
+
+def _window(comparison: Comparison, name: str) -> tuple[int, int]:
+    motion = comparison.motions[name]
+    return worst_seconds(motion.soles, motion.clip.fps)
+
+
+def _limits(comparison: Comparison) -> Section:
+    animation, clip = comparison.animation, comparison.animation.clip
+    lines = [
+        "The systems are compared on this clip and this ground alone; on others they may stand "
+        "differently."
+    ]
+    if comparison.captured is None:
+        lines.append(
+            "The captured motion is not known: figures say how feet stand on the ground, not "
+            "whether people would move like this."
+        )
+    if clip.fps > MAX_RATE:
+        lines.append(
+            f"The view shows {MAX_RATE:g} frames a second or fewer; all figures are of all frames, "
+            f"at {clip.fps:g} Hz."
+        )
+    if clip.stance is None:
+        lines.append("The clip has no contact labels; stances are found by its motion.")
+    if groundless := comparison.animated.measures.groundless:
+        lines.append(
+            f"{percent(groundless)} of the animated soles' points have no ground under them and "
+            "are left out."
+        )
+    notes = [
+        f"Root: {animation.root.reason}. Presets that leave the character's height to their game "
+        "(`unreal`, `mec`) have it on the ground below it, unless `--root animation` was given."
+    ]
+    if in_the_air := flight.describe(clip):
+        notes.append(f"{in_the_air.capitalize()}.")
+    return Section(
+        "Limits of the data", [Points(lines), Points([*notes, *clip.remarks], brief=True)]
+    )
+
+
+def _asked(comparison: Comparison) -> Table:
+    animation = comparison.animation
+    clip = animation.clip
+    rows = [
+        ["Clip and ground", comparison.title],
+        ["Frames", f"{clip.frame_count}, {clip.seconds:.2f} s at {clip.fps:g} Hz"],
+        ["Systems", ", ".join(f"`{name}`" for name in comparison.systems)],
+        ["Root", animation.root.root],
+    ]
+    if animation.speed != 1.0:
+        rows.append(["Speed", f"{animation.speed:g} times that of the clip"])
+    if animation.tracks:
+        rows.append(["Tracks", ", ".join(f"`{name}`" for name in animation.tracks)])
+    if comparison.rates:
+        rates = dict.fromkeys(f"{row.fps:g} Hz" for row in comparison.rates)
+        rows.append(["Other frame rates", ", ".join(rates)])
+    return rows
+
+
+def findings(comparison: Comparison) -> list[Finding]:
+    """What is worst, which system stands best, and which is closest to the captured motion.
+
+    Where that is not known, the last one says which system reaches its targets.
+    """
+    last = _closeness(comparison) if comparison.accuracy else _reach(comparison)
+    return [_worst_finding(comparison), _standing(comparison), last]
+
+
+def beyond(comparison: Comparison) -> list[str]:
+    """Names of systems of which something is beyond its bound."""
+    return [name for name in comparison.systems if _nearest(comparison, name).is_beyond]
+
+
+def _nearest(comparison: Comparison, name: str) -> Bounded:
+    """What is furthest beyond its bound, or nearest to it."""
+    return next(iter(comparison.against(name)), UNKNOWN)
+
+
+def _worst_system(comparison: Comparison) -> str:
+    return max(comparison.systems, key=lambda name: _nearest(comparison, name).excess)
+
+
+def _worst_finding(comparison: Comparison) -> Finding:
+    failing, name = beyond(comparison), _worst_system(comparison)
+    words = _nearest(comparison, name).words
+    if not failing:
+        whole = "The system stays" if len(comparison.systems) == 1 else "All systems stay"
+        return Finding(f"{whole} within all bounds; nearest to one comes `{name}`: {words}.")
+    others = [f"`{other}`" for other in failing if other != name]
+    also = ""
+    if others:
+        also = f"; {listed(others)} {'goes' if len(others) == 1 else 'go'} beyond a bound, too"
+    return Finding(f"Worst is `{name}`: {words}{also}.", bad=True)
+
+
+def _standing(comparison: Comparison) -> Finding:
+    shares = {name: comparison.motions[name].measures.contact for name in comparison.systems}
+    shares = {name: share for name, share in shares.items() if not math.isnan(share)}
+    if not shares:
+        return Finding("No standing foot has ground under it, so nothing is known of them.", True)
+    best, before = max(shares, key=shares.__getitem__), comparison.animated.measures.contact
+    without = "" if math.isnan(before) else f", {percent(before)} without foot IK"
+    measure = f"in {percent(shares[best])} of their frames{without}"
+    if shares[best] <= before:
+        return Finding(
+            f"No system keeps standing feet on the ground better than the animation has them: "
+            f"`{best}` {measure}.",
+            bad=before < 1.0,
+        )
+    return Finding(f"`{best}` keeps standing feet on the ground best: {measure}.")
+
+
+def _closeness(comparison: Comparison) -> Finding:
+    distances = {name: of.ankle for name, of in comparison.accuracy.items()}
+    before = distances.pop(ANIMATED)
+    best, worst = (choose(distances, key=distances.__getitem__) for choose in (min, max))
+    without = f"; without foot IK it is {100 * before:.1f} cm"
+    if distances[best] >= before:
+        return Finding(
+            f"No system comes closer to the captured motion than the flat animation: the best, "
+            f"`{best}`, has its ankles {100 * distances[best]:.1f} cm away (rms){without}.",
+            bad=True,
+        )
+    furthest = f", furthest is `{worst}` with {100 * distances[worst]:.1f} cm"
+    return Finding(
+        f"Closest to the captured motion is `{best}`, whose ankles are "
+        f"{100 * distances[best]:.1f} cm away (rms){furthest if len(distances) > 1 else ''}"
+        f"{without}."
+    )
+
+
+def _reach(comparison: Comparison) -> Finding:
+    shares = {name: comparison.motions[name].measures.reached for name in comparison.systems}
+    shares = {name: share for name, share in shares.items() if not math.isnan(share)}
+    if not shares:
+        return Finding("No standing foot has a target, as there is no ground under any.", bad=True)
+    best, least = (choose(shares, key=shares.__getitem__) for choose in (max, min))
+    text = f"`{best}` reaches {percent(shares[best])} of the targets of its standing feet"
+    if len(shares) > 1:
+        text += f", the most of all, and `{least}` {percent(shares[least])}, the fewest"
+    unknown = "how close that is to captured motion is not known, as there is none to compare with"
+    return Finding(f"{text}; {unknown}.")
+
+
+def shown(comparison: Comparison, systems: tuple[str, ...], watched: str) -> ShownClip:
+    """What the view shows: colours are those of the plots.
+
+    Args:
+        comparison: with the motions.
+        systems: names of all systems, which decide the colours.
+        watched: the one that is watched at first, if it gave a motion.
+    """
+    flat = motion_data.ANIMATED._replace(colour=BEFORE)
+    looks = {ANIMATED: flat} | {
+        name: Look(COLOURS[index % len(COLOURS)], RADIUS) for index, name in enumerate(systems)
+    }
+    motions = {
+        key(name): ShownMotion(
+            "flat animation" if name == ANIMATED else name,
+            motion,
+            looks[name],
+            visible=name != ANIMATED,
+            worst=_window(comparison, name),
+        )
+        for name, motion in comparison.motions.items()
+    }
+    if comparison.captured is not None:
+        motions[CAPTURE] = ShownMotion(
+            "captured", comparison.captured, motion_data.CAPTURED, visible=True
+        )
+    # Rays start above the highest motion, so that one inside a hill does not hide the hill.
+    clips = [motion.clip for motion in comparison.motions.values()]
+    highest = max(clips, key=lambda clip: float(clip.positions_ws[..., 1].max()))
+    return ShownClip(
+        motions,
+        comparison.animated.clip.stance_labels(),
+        ground_path.around_path(highest, comparison.animation.terrain),
+        watched=key(watched if watched in comparison.motions else ANIMATED),
+    )
+
+
+def key(name: str) -> str:
+    """Of the motion of a system, or of the animation, in the view."""
+    return f"motion {name}"
+
+
+@in_float64
+def compare(
+    systems: Mapping[str, jaxik.FootIK],
+    animation: animations.AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    rates: Sequence[float] = (),
+) -> Comparison:
+    """Runs several systems on a flat animation and measures them side by side; warns as `solve`.
+
+    Args:
+        systems: by name.
+        animation: the clip, the terrain, and where the root is put for all systems.
+        output: folder for the table, the numbers, the figure and the page.
+        rates: Hz, at which each system runs too, to see how much its motion depends on them.
+
+    Raises:
+        ValueError: there is no system, a file cannot be read, a system does not fit the clip or
+            gives poses that are not finite, a rate is above the clip's, or the folder cannot be
+            made.
+    """
+    if not systems:
+        raise ValueError("systems is empty; wanted one or more")
+    with output_folder(output) as folder:
+        systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
+        title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
+        loaded = animations.load_animation(animation)
+        compared = run_systems(systems, loaded, title=title)
+        compared = replace(compared, rates=animations.measure(systems, loaded, rates))
+        publish(folder, document(compared))
+        for name, cause in compared.causes.items():
+            animations.warn(compared.motions[name].measures, loaded.bounds, cause, name)
+        return compared

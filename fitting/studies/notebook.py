@@ -15,8 +15,7 @@ from fitting.report.formatting import Table, interval, number
 from fitting.runtime import display
 from jaxik.maths import parameter_tree
 
-from . import comparison_report
-from .comparison import Comparison
+from .comparison import Comparison, document
 from .fit import fit_plots, fit_tables
 from .fit.fit import Fit
 from .sample import posterior_plots, posterior_report
@@ -135,7 +134,7 @@ def posterior_html(posterior: Posterior) -> str:
 @display.html.register
 def comparison_html(comparison: Comparison) -> str:
     """What it found, the measures of each system, and its motion."""
-    return document_html(comparison_report.document(comparison))
+    return document_html(document(comparison))
 
 
 def document_html(document: Document) -> str:

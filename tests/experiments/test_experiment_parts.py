@@ -20,7 +20,7 @@ from fitting.experiment.systems import Preset
 from fitting.motion import playback
 from fitting.problem.scene import legs_ws, pelvis_ws
 from fitting.report.document import Grid, Text
-from fitting.studies import ablation, animation_jobs
+from fitting.studies import ablation, animations
 from fitting.studies.animations import AnimationFiles
 from fitting.studies.fit import fit_jobs, record_price
 from fitting.studies.fit.fit import Fit
@@ -155,9 +155,9 @@ def test_a_run_is_applied_to_the_body_of_the_animation(tmp_path, monkeypatch):
     (tmp_path / "fit.json").write_text(json.dumps({"parameters": rows}))
     save_clip(tmp_path / "giant.npz", scaled(load_clip(BASE), 2.0))
     applied = []
-    monkeypatch.setattr(animation_jobs, "solve", lambda ik, *_, **__: applied.append(ik))
+    monkeypatch.setattr(animations, "solve", lambda ik, *_, **__: applied.append(ik))
     files = AnimationFiles(tmp_path / "giant.npz", tmp_path / "unused.ply")
-    animation_jobs.apply(tmp_path, files)
+    animations.apply(tmp_path, files)
     ratio = body.leg_length(files.flat_clip.rig) / 0.84
     height = float(parameter_tree.get(applied[0], "target.foot_height"))
     assert height == pytest.approx(0.1 * ratio) and ratio > 1.9

@@ -18,7 +18,7 @@ from fitting.motion.accuracy import Accuracy
 from fitting.motion.goodness import CLOSE, MOTIONS, PARTS
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
-from fitting.studies import ablation
+from fitting.studies import ablation, population
 from fitting.studies.ablation import Row
 from fitting.studies.calibrate import calibration, wrong_model
 from fitting.studies.calibrate.replicates import (
@@ -27,7 +27,6 @@ from fitting.studies.calibrate.replicates import (
     LOG_PROBABILITY,
     make_replicates,
 )
-from fitting.studies.population import population
 from support.curves import curve_problem
 from support.watching import listening
 

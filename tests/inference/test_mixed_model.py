@@ -22,7 +22,7 @@ from fitting.inference.mixed_model import (
 )
 from fitting.problem.problem import Problem
 from fitting.problem.space import ParameterPrior, Priors, Space
-from fitting.studies.population.population import summarise
+from fitting.studies.population import summarise
 from support.problems import parameter, problem_of
 
 # The linear mixed model

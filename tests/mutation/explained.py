@@ -28,7 +28,7 @@ NO_SIGN = "any negative number lets NumPy work out the length"
 REASONS = {
     "fitting/studies/calibrate/calibration.py": [("Line2D([], [], color=", "", LOOK)],
     "fitting/studies/fit/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
-    "fitting/studies/population/population.py": [("columns=5", "columns= 4", LOOK)],
+    "fitting/studies/population.py": [("columns=5", "columns= 4", LOOK)],
     "fitting/bench/baselines.py": [
         ("(flat_ankle, axis=-1)", "(flat_ankle, axis=1)", "there are two axes")
     ],

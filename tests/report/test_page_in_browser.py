@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fitting.report import pages
-from fitting.studies import comparison_report
+from fitting.studies import comparison
 from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
 from support import comparisons, runs
@@ -44,7 +44,7 @@ def comparison_path(tmp_path_factory) -> Path:
     """The page of two systems that are 10 cm apart, the lower one watched."""
     folder = tmp_path_factory.mktemp("compared")
     compared = comparisons.invented_comparison(comparisons.walk())
-    comparison_report.document(compared).write(folder)
+    comparison.document(compared).write(folder)
     return folder / pages.PAGE
 
 

@@ -24,7 +24,7 @@ from fitting.problem.scene import legs_ws
 from fitting.report import document, formatting, motion_data, pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.style import save
-from fitting.studies import animations, comparison, comparison_report
+from fitting.studies import animations, comparison
 from fitting.studies.fit import (
     fit_motions,
     fit_plots,
@@ -422,7 +422,7 @@ def compared():
 def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
     compared, tmp_path, undrawn
 ):
-    comparison_report.document(compared).write(tmp_path)
+    comparison.document(compared).write(tmp_path)
     page = Page(tmp_path / pages.PAGE)
     assert page.text.startswith(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
@@ -472,10 +472,10 @@ def test_the_worst_is_named_and_no_system_praised_that_is_worse_than_the_animati
         for name, measures in (("close", still), ("deep", popping))
     }
     other = dataclasses.replace(compared, motions=compared.motions | motions)
-    assert comparison_report.beyond(other) == ["deep"]
+    assert comparison.beyond(other) == ["deep"]
     captured = {comparison.ANIMATED: compared.motions["close"]}
     far = dataclasses.replace(compared, motions=compared.motions | captured)
-    last = comparison_report.findings(far)[2]
+    last = comparison.findings(far)[2]
     assert last.bad and last.text.startswith("No system comes closer to the captured motion")
 
 

@@ -22,7 +22,7 @@ from fitting.motion import measures
 from fitting.motion.flat_animation import load_flat_animation
 from fitting.motion.measures import MEASURES
 from fitting.report import pages, style
-from fitting.studies import animations, comparison, comparison_report
+from fitting.studies import animations, comparison
 from fitting.studies.animations import Animation, every_frame, measure
 from fitting.synthetic import walker
 from fitting.synthetic.walker import WalkStyle
@@ -69,7 +69,7 @@ def compared(folder) -> Compared:
 
 
 def numbers(folder: Path) -> dict[str, dict]:
-    content = json.loads((folder / comparison_report.NUMBERS).read_text())
+    content = json.loads((folder / comparison.NUMBERS).read_text())
     return {system.pop("name"): system for system in content["systems"]}
 
 
@@ -127,10 +127,10 @@ def test_a_walk_neither_sinks_nor_floats_on_ground_at_the_height_of_its_floor(fo
     walk = clips.load_clip(folder / "walk.npz")
     lifted = walk.with_motion(walk.positions_ws + [0.0, 0.3, 0.0], walk.rotations_ws)
     ground = terrain.plane(point=(0.0, 0.3, 0.0), normal=(0.0, 1.0, 0.0))
-    on_floor = comparison.compare({}, Animation(lifted, ground, floor=0.3))
+    on_floor = comparison.run_systems({}, Animation(lifted, ground, floor=0.3))
     measured = on_floor.animated.measures
     assert measured.floating_height < 1e-3 and measured.penetration_depth < 1e-3
-    below_ground = comparison.compare({}, Animation(walk, ground))
+    below_ground = comparison.run_systems({}, Animation(walk, ground))
     measured = below_ground.animated.measures
     assert measured.worst["penetration"].value == pytest.approx(0.3, abs=0.01)
     assert measured.floating_height == 0.0
@@ -142,15 +142,15 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
     corners = np.array([[-9.0, 0.0, middle], [9.0, 0.0, middle], [0.0, 0.0, middle - 99.0]])
     triangle = np.array([[0, 1, 2]])
     systems = {"ozz": preset_system("ozz")}
-    half = comparison.compare(
+    half = comparison.run_systems(
         systems, Animation(walk, terrain.mesh(corners, triangle)), title="half"
     )
     assert 0.3 < half.animated.measures.groundless < 0.7
     assert np.isfinite(half.animated.measures.floating_height)
-    comparison_report.document(half).write(tmp_path)
-    assert "have no ground under them" in (tmp_path / comparison_report.TABLE).read_text()
-    none = comparison.compare(systems, Animation(walk, terrain.mesh(corners - 999.0, triangle)))
-    comparison_report.document(none).write(tmp_path)
+    comparison.document(half).write(tmp_path)
+    assert "have no ground under them" in (tmp_path / comparison.TABLE).read_text()
+    none = comparison.run_systems(systems, Animation(walk, terrain.mesh(corners - 999.0, triangle)))
+    comparison.document(none).write(tmp_path)
     assert numbers(tmp_path)[comparison.ANIMATED]["floating_height"] is None
 
 
@@ -159,9 +159,9 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
 
 def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
     folder = compared.folder
-    table, figure = folder / comparison_report.TABLE, folder / comparison_report.FIGURE
+    table, figure = folder / comparison.TABLE, folder / comparison.FIGURE
     page, files = folder / pages.PAGE, {path.name for path in folder.iterdir()}
-    assert files == {page.name, table.name, figure.name, comparison_report.NUMBERS}
+    assert files == {page.name, table.name, figure.name, comparison.NUMBERS}
     (clip,) = Page(page).data["clips"]
     labels = [skeleton["label"] for skeleton in clip["skeletons"]]
     assert clip["frames"] == 61 and labels == ["flat animation", "still", "record"]
@@ -186,7 +186,7 @@ def test_the_terminal_shows_the_table_and_warnings(compared):
         line.split() for line in compared.out.splitlines() if line.strip().startswith("bound")
     ]
     assert headings == [["bound", "as", "animated", "still", "record"]]
-    assert f"read {compared.folder / comparison_report.TABLE}" in compared.out
+    assert f"read {compared.folder / comparison.TABLE}" in compared.out
     assert "\n- Root: as animated: the ground is " in compared.out
     lines = compared.err.splitlines()
     assert lines and all(line.startswith(("jaxik: record: ", "jaxik: still: ")) for line in lines)
@@ -194,14 +194,14 @@ def test_the_terminal_shows_the_table_and_warnings(compared):
 
 def test_a_figure_distinguishes_more_systems_than_there_are_colours():
     names = [f"system {index}" for index in range(15)]
-    styles = comparison_report._line_styles(names)
+    styles = comparison._line_styles(names)
     assert len({(style_["color"], style_["linestyle"]) for style_ in styles.values()}) == len(names)
     assert styles["system 0"]["color"] == style.BEFORE
 
 
 def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
     compared = comparisons.invented_comparison(comparisons.walk(10.0))
-    figure = comparison_report.overview(compared)
+    figure = comparison.overview(compared)
     upper, lower = figure.subfigs
     assert len(upper.axes) == 2 * (2 + 1) and len(lower.axes) == len(MEASURES)
     reached = lower.axes[list(MEASURES).index("reached")]
@@ -273,7 +273,7 @@ def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path
     assert main.main([str(word) for word in words]) == 0
     row = "ozz 60 Hz 83.3 83.3 83.3 83.3 83.3"
     assert row in " ".join(capsys.readouterr().out.split())
-    text = (tmp_path / "out" / comparison_report.TABLE).read_text()
+    text = (tmp_path / "out" / comparison.TABLE).read_text()
     assert "## At other frame rates" in text
     assert "h2 At other frame rates" in Page(tmp_path / "out" / pages.PAGE).headings
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text

@@ -16,13 +16,12 @@ from fitting.cli import main
 from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.profiles import profiling
 from fitting.runtime.claimed_folder import LOCK, claimed
-from fitting.studies import ablation
+from fitting.studies import ablation, population
 from fitting.studies.calibrate import replicates
 from fitting.studies.fit import assess, fit_jobs, run_folder
 from fitting.studies.fit.fit import Fit
 from fitting.studies.many import fit_many
 from fitting.studies.many.fit_many import plan
-from fitting.studies.population import population
 from support import runs, small_studies
 from support.experiments import ROOT, write
 from support.small_studies import HALF_SECOND, ONE_START, TWO_HALF_SECONDS, kept

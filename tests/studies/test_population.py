@@ -17,9 +17,9 @@ from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.experiment_files import load_experiment
 from fitting.inference.noise import NoiseOptions
 from fitting.report import document, pages
+from fitting.studies import population
 from fitting.studies.campaign import clip_names
-from fitting.studies.population import population
-from fitting.studies.population.population import Population
+from fitting.studies.population import Population
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page

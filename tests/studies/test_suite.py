@@ -15,8 +15,8 @@ from fitting.motion import measures
 from fitting.motion.measures import BOUNDED
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
-from fitting.studies import comparison_report, suite, suite_report
-from fitting.studies.suite import Suite, run_suite
+from fitting.studies import comparison, suite
+from fitting.studies.suite import Suite, run_situations
 from fitting.synthetic import footsteps
 from jaxik.maths import parameter_tree
 
@@ -39,8 +39,8 @@ def written(still, tmp_path_factory):
     """A suite of a system without effect and one that fails, and the folder of its report."""
     folder = tmp_path_factory.mktemp("suite") / "new"
     failing = parameter_tree.replace(still, {"leg.weight": np.ones(3)})
-    suite = jobs.run_suite(lambda rig: {"still": still, "failing": failing}, plan(*FEW), folder)
-    return suite, folder
+    finished = jobs.run_suite(lambda rig: {"still": still, "failing": failing}, plan(*FEW), folder)
+    return finished, folder
 
 
 # Situations
@@ -116,8 +116,8 @@ def test_a_curb_allows_as_much_as_a_smooth_swing_onto_it_needs():
 
 
 def test_a_system_without_effect_is_within_bounds_on_the_flat_and_not_on_stairs(written):
-    suite, _ = written
-    flat, stairs = suite.scenes
+    finished, _ = written
+    flat, stairs = finished.scenes
     assert flat.beyond("still") == []
     assert "penetration" in [bounded.name for bounded in stairs.beyond("still")]
     slide = stairs.comparison.motions["still"].measures.slide
@@ -125,12 +125,12 @@ def test_a_system_without_effect_is_within_bounds_on_the_flat_and_not_on_stairs(
 
 
 def test_the_numbers_are_those_of_the_measures_and_a_failure_is_beyond_all_bounds(written):
-    suite, folder = written
-    within, count = suite.counts
+    finished, folder = written
+    within, count = finished.counts
     assert count == 2 * 2 * len(BOUNDED) and within < count / 2
-    content = json.loads((folder / suite_report.NUMBERS).read_text())
-    assert (content["within"], content["measures"]) == suite.counts
-    for name, scene, numbers in zip(FEW, suite.scenes, content["situations"], strict=True):
+    content = json.loads((folder / suite.NUMBERS).read_text())
+    assert (content["within"], content["measures"]) == finished.counts
+    for name, scene, numbers in zip(FEW, finished.scenes, content["situations"], strict=True):
         assert numbers["title"] == name and "leg.weight" in numbers["failures"]["failing"]
         assert numbers["bounds"] == pytest.approx(scene.comparison.bounds)
         _, still = numbers["systems"]
@@ -141,16 +141,16 @@ def test_the_numbers_are_those_of_the_measures_and_a_failure_is_beyond_all_bound
 
 
 def test_what_is_beyond_its_bound_has_a_mark_and_is_red_in_the_page_and_the_table(written):
-    suite, folder = written
-    table = suite_report.table(suite)
+    finished, folder = written
+    table = suite.table(finished)
     stairs = next(row for row in table if row[1] == "still" and row is not table[2])
-    assert stairs[2].endswith(comparison_report.MISS)
-    text = (folder / suite_report.TABLE).read_text()
+    assert stairs[2].endswith(comparison.MISS)
+    text = (folder / suite.TABLE).read_text()
     assert f'<span style="color:red">**{stairs[2]}**</span>' in text
     assert all(measure.reason in text for measure in BOUNDED.values())
     assert "stairs up, still: penetration" in text and "no motion: " in text
-    assert (folder / suite_report.PAGE).read_bytes().startswith(b"\x89PNG")
-    low, high = suite_report.page(suite).axes[0].get_ylim()
+    assert (folder / suite.PAGE).read_bytes().startswith(b"\x89PNG")
+    low, high = suite.page(finished).axes[0].get_ylim()
     assert -0.3 < low < -0.2 and 1.0 < high < 1.2  # from below the soles to above the pelvis
 
 
@@ -162,12 +162,12 @@ def test_an_interrupted_suite_keeps_what_is_finished(still, tmp_path):
                 raise KeyboardInterrupt
 
     with activity.watched_by(Interrupt()):
-        suite = jobs.run_suite(lambda rig: {"still": still}, plan(*FEW), tmp_path)
-    assert suite.interrupted and [scene.situation.name for scene in suite.scenes] == [FEW[0]]
-    assert json.loads((tmp_path / suite_report.NUMBERS).read_text())["interrupted"]
+        finished = jobs.run_suite(lambda rig: {"still": still}, plan(*FEW), tmp_path)
+    assert finished.interrupted and [scene.situation.name for scene in finished.scenes] == [FEW[0]]
+    assert json.loads((tmp_path / suite.NUMBERS).read_text())["interrupted"]
     assert (
         "1 situations are missing, as the suite was interrupted"
-        in (tmp_path / suite_report.TABLE).read_text()
+        in (tmp_path / suite.TABLE).read_text()
     )
 
 
@@ -182,7 +182,7 @@ def test_the_command_prints_the_table_whatever_is_in_it(monkeypatch, still, tmp_
     assert main.main(words) == 0
     printed = capsys.readouterr()
     assert re.search(rf"^\d+ of {len(BOUNDED)} within bounds\.$", printed.out, re.MULTILINE)
-    assert comparison_report.MISS in printed.out and "\x1b" not in printed.out
+    assert comparison.MISS in printed.out and "\x1b" not in printed.out
 
 
 def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
@@ -222,7 +222,7 @@ def test_what_is_within_its_bounds_stays_so(chosen):
 
     assert not [
         (name, scene.situation.name, bounded.words)
-        for scene in run_suite(systems_of, chosen).scenes
+        for scene in run_situations(systems_of, chosen).scenes
         for name, known in KNOWN_MISSES.items()
         for bounded in scene.beyond(name)
         if bounded.name not in known.get(scene.situation.name, "").split()

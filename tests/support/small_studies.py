@@ -10,10 +10,9 @@ import numpy as np
 from pytest import MonkeyPatch
 
 from fitting.experiment import problems
-from fitting.studies import ablation
+from fitting.studies import ablation, population
 from fitting.studies.animations import Animation
 from fitting.studies.calibrate import replicates
-from fitting.studies.population import population
 from jaxik.maths import parameter_tree
 
 from . import quick

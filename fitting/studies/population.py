@@ -50,12 +50,13 @@ from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
-from fitting.studies.campaign import Campaign, clip_names
-from fitting.studies.fit import run_folder
-from fitting.studies.fit.assess import search_identity, search_with_noise
-from fitting.studies.fit.fit import SearchRecord, record_search
-from fitting.studies.output import output_folder, publish
 from jaxik.maths import parameter_tree
+
+from .campaign import Campaign, clip_names
+from .fit import run_folder
+from .fit.assess import search_identity, search_with_noise
+from .fit.fit import SearchRecord, record_search
+from .output import output_folder, publish
 
 SEARCHES = "searches"
 DRAWS = 2000  # from the hierarchy
