@@ -25,6 +25,7 @@ from .studies.population import population as population
 from .studies.sample.run_comparison import compare_runs as compare_runs
 from .studies.sample.sample_jobs import sample as sample
 from .studies.suite import run_suite as run_suite
+from .studies.terrain_report import reconstruct_terrain as reconstruct_terrain
 from .studies.translation import translate as translate
 from .viewer.views import view as view
 from .viewer.views import view_run as view_run

@@ -102,21 +102,15 @@ def terrain(options: argparse.Namespace) -> int:
     that is not clearly worse is written. A plot and all numbers go beside it: ground.png,
     ground.json.
     """
-    from fitting.clips import load_clip
-    from fitting.ground.reconstruction import reconstruct
-    from fitting.report.document import text
-    from fitting.studies import terrain_report
+    from fitting import jobs
 
-    terrain_report.check_output_files(options.output)
-    with activity.announced(f"Reading {options.clip.name}"):
-        clip = load_clip(options.clip, **clip_options(options).given)
-    kind = None if options.model == "auto" else options.model
-    with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
-        ground = reconstruct(clip, kind=kind)
-    with activity.announced("Drawing and writing the ground"):
-        report = terrain_report.write(options.output, ground, clip, options.margin)
-    show(text(report))
-    print(f"\nwritten to {options.output}")
+    jobs.reconstruct_terrain(
+        options.clip,
+        options.output,
+        model=None if options.model == "auto" else options.model,
+        margin=options.margin,
+        options=clip_options(options),
+    )
     return 0
 
 

@@ -601,7 +601,9 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
         grounds = reconstruct_grounds(request, clips, folder)
         meshes = [ground.mesh for ground in grounds if ground is not None]
         for mesh in meshes:
-            terrain_report.check_new_files(mesh)
+            for path in terrain_report.output_files(mesh):
+                if path.exists():
+                    raise ValueError(f"{path}: is there already; name another folder")
         try:
             with activity.announced("Writing and drawing the ground"):
                 for ground in grounds:
@@ -610,7 +612,8 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
             drafted = draft(request, clips, folder, grounds)
         except BaseException:  # also Ctrl-C: ground without an experiment is of no use
             for mesh in meshes:
-                terrain_report.remove(mesh)
+                for path in terrain_report.output_files(mesh):
+                    path.unlink(missing_ok=True)
             raise
         path = drafted.experiment.path
         files.write_text(path, as_toml(drafted))

@@ -1,4 +1,4 @@
-"""The files of a terrain reconstructed from motion (mesh, numbers, picture), and its text."""
+"""Ground reconstructed from a clip: the job, and its files (mesh, numbers, picture)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from fitting.clips.clip import Clip
+from fitting.clips import Clip, load_clip
+from fitting.clips.load import AS_FOUND, ClipOptions
 from fitting.ground import meshes
 from fitting.ground.reconstruction import (
     SURFACE_KINDS,
@@ -22,12 +23,14 @@ from fitting.ground.reconstruction import (
     Reconstruction,
     Surface,
     ThinPlate,
+    reconstruct,
 )
 from fitting.report import style
-from fitting.report.document import Document, Finding, Grid, Plot, Section, Text
-from fitting.report.formatting import Table, interval
+from fitting.report.document import Document, Finding, Grid, Plot, Section, Text, text
+from fitting.report.formatting import Table, interval, joined
 from fitting.report.style import BEFORE, GROUND, STAGES, legend, styled
-from fitting.runtime import files
+from fitting.runtime import activity, files
+from fitting.runtime.precision import in_float64
 
 NUMBERS, FIGURE = ".json", ".png"  # beside the mesh, under its name
 
@@ -37,28 +40,45 @@ PIXELS = 300  # along the longer side of the plan
 LEGS = "o^sDvP*X"  # marks of the legs
 
 
-def check_output_files(mesh: Path) -> None:
-    """Checks that the mesh, its numbers and its picture can be written.
+@in_float64
+def reconstruct_terrain(
+    clip: str | Path,
+    output: str | Path,
+    *,
+    model: str | None = None,
+    margin: float = 1.0,
+    options: ClipOptions = AS_FOUND,
+) -> Reconstruction:
+    """Reconstructs the ground of a captured clip from its stances, and writes it as a mesh.
+
+    Args:
+        clip: the file of the clip.
+        output: .ply, .obj or .stl file; all numbers and a picture go beside it, under its name.
+        model: which of `SURFACE_KINDS` is written; None chooses by the error of prediction.
+        margin: how far the mesh extends beyond the stances, m.
+        options: how the clip is read.
 
     Raises:
-        ValueError: if one of them cannot, or the mesh has an unknown suffix.
+        ValueError: the clip cannot be read or has too few stances, a file cannot be written, or
+            there is no such model.
     """
+    path, mesh = Path(clip), Path(output)
     meshes.check_mesh_name(mesh)
-    for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
-        files.check_output_file(path)
+    for file in output_files(mesh):
+        files.check_output_file(file)
+    with activity.announced(f"Reading {path.name}"):
+        captured = load_clip(path, **options.given)
+    with activity.announced(f"Reconstructing the ground of {path.name}"):
+        terrain = reconstruct(captured, kind=model)
+    with activity.announced("Drawing and writing the ground"):
+        report = write(mesh, terrain, captured, margin)
+    activity.log(joined([text(report), "", f"written to {mesh}"]))
+    return terrain
 
 
-def check_new_files(mesh: Path) -> None:
-    """Raises ValueError where a file that `write` would write is there already."""
-    for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
-        if path.exists():
-            raise ValueError(f"{path}: is there already; name another folder")
-
-
-def remove(mesh: Path) -> None:
-    """Removes what `write` has written, as far as it is there."""
-    for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
-        path.unlink(missing_ok=True)
+def output_files(mesh: Path) -> tuple[Path, Path, Path]:
+    """The files that `write` writes."""
+    return mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)
 
 
 def write(mesh: Path, terrain: Reconstruction, clip: Clip, margin: float) -> Document:
