@@ -172,10 +172,10 @@ def view(options: argparse.Namespace) -> int:
         return 0
     folder = options.output or Path()
     check_folder(folder)
-    animation, preset, given = _animation(options), Preset(options.preset), None
+    animation, preset, ik = _animation(options), Preset(options.preset), None
     if options.parameters is not None:
-        given, preset = load_system(options.parameters, animation.flat_clip.rig)
-    session = viewer.session_of_animation(animation, preset, given)
+        ik, preset = load_system(options.parameters, animation.flat_clip.rig)
+    session = viewer.session_of_animation(animation, preset, ik)
     jobs.view(session, folder, address)
     return 0
 
@@ -298,7 +298,7 @@ def _check_comparison(options: argparse.Namespace) -> None:
         if getattr(options, name):
             raise ValueError(f"--{name} belongs to --suite, which is not given")
     needed = {"CLIP": options.clip, "--terrain": options.terrain, "-o/--output": options.output}
-    if missing := [name for name, given in needed.items() if given is None]:
+    if missing := [name for name, value in needed.items() if value is None]:
         raise ValueError(f"the following are required: {', '.join(missing)}; or --suite, or --runs")
 
 

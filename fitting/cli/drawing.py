@@ -35,7 +35,7 @@ NAME, HEADING, MARK = "cyan", "bold", "red"  # styles
 SPACE = 2  # columns between others
 
 
-class LiveLines(terminal.Shown):
+class LiveLines(terminal.LogPrinter):
     """A line for each work that is going on, with a bar where its parts are counted.
 
     What took longer than a moment leaves a line with its duration, unless it is part of other work.

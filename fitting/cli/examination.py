@@ -83,7 +83,7 @@ def print_findings(findings: Iterator[Finding], width: int) -> int:
 
 
 def _guarded(subject: str, examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """The findings; one more where looking itself fails."""
+    """The findings; one more where the examination itself fails."""
     try:
         yield from examine()
     except jax_start.StartError as error:

@@ -57,16 +57,16 @@ def inspect(options: argparse.Namespace) -> int:
     from fitting.clips.load import draft_joint_map
     from fitting.report.formatting import TableText
 
-    how = clip_options(options)
+    reading = clip_options(options)
     if options.joints == TEMPLATE:
         if options.json:
             raise ValueError("--json is for what was understood, and not for a joint map")
         with activity.announced(f"Reading {options.clip.name}"):
-            drafted = draft_joint_map(options.clip, how)
+            drafted = draft_joint_map(options.clip, reading)
         print(drafted)
         return 0
     with activity.announced(f"Reading {options.clip.name}"):
-        clip = load_clip(options.clip, **how.given)
+        clip = load_clip(options.clip, **reading.given)
     described = summary.describe(clip)
     if options.json:
         print(summary.as_json(described))

@@ -190,8 +190,8 @@ def calibrate(options: argparse.Namespace) -> int:
     Truths are drawn from the experiment's prior. Each fit is written when it is done: after
     Ctrl-C (status 130) the same command continues, also with a larger -n or with --chains. The
     exit status is 0 if everything is inside its bounds, else 5. With --truth another system
-    makes the motion, a capture's errors are added, and asked is whether the fit is worth
-    keeping and its verdict true on frames that were held out.
+    makes the motion, a capture's errors are added, and the question is whether the fit is worth
+    saving and its verdict true on frames that were held out.
     """
     from fitting import jobs
 
@@ -306,7 +306,7 @@ def sample(options: argparse.Namespace) -> int:
     jaxik sample runs/walk
     jaxik sample runs/walk --max-steps 40000      continue, if 20000 were not enough
 
-    Ctrl-C keeps the chain and ends with status 130; the same command continues it, even after
+    Ctrl-C saves the chain and ends with status 130; the same command continues it, even after
     the process was killed.
     """
     from fitting import jobs
@@ -370,10 +370,12 @@ def translate(options: argparse.Namespace) -> int:
             f"{len(options.clip)} clip(s) and {len(options.terrain)} terrain(s); wanted a terrain "
             "for each clip"
         )
-    how_clip, how_terrain = clip_options(options), terrain_options(options)
-    how_clip.check_use(options.clip, "--clip")
+    clip_reading, terrain_reading = clip_options(options), terrain_options(options)
+    clip_reading.check_use(options.clip, "--clip")
     animations = tuple(
-        AnimationFiles(clip, mesh, clip_options=how_clip.of_file(clip), terrain_options=how_terrain)
+        AnimationFiles(
+            clip, mesh, clip_options=clip_reading.of_file(clip), terrain_options=terrain_reading
+        )
         for clip, mesh in zip(options.clip, options.terrain, strict=True)
     )
     rig = animations[0].flat_clip.rig

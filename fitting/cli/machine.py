@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.runtime import activity
-from fitting.runtime.validation import in_one_line
 
 from . import status
 from .options import argument, command, flag
@@ -57,7 +56,7 @@ def _print_line(line: str) -> None:
     flag("--clear", "remove the programs"),
 )  # fmt: skip
 def cache(options: argparse.Namespace) -> int:
-    """Show where compiled programs are kept between calls, or remove them.
+    """Show where compiled programs are cached between calls, or remove them.
 
     jaxik cache
     jaxik cache --clear     other files in that folder stay
@@ -66,24 +65,20 @@ def cache(options: argparse.Namespace) -> int:
     from fitting.runtime import cache_folder
 
     cache_folder.use_default()
-    folder = Path(str(cache_folder.setting(cache_folder.FOLDER) or cache_folder.default()))
-    traced, compiled = cache_folder.kept_programs(folder)
+    folder = cache_folder.used_folder()
+    traced, compiled = cache_folder.cached_programs(folder)
     if options.clear:
         size = _megabytes([*traced, *compiled])
         for path in (*traced, *compiled):
             path.unlink(missing_ok=True)
         print(f"removed {len(traced)} traced and {len(compiled)} compiled, {size}, from {folder}")
         return 0
-    try:
-        cache_folder.traced()
-        used = "yes"
-    except (cache_folder.SwitchedOffError, OSError) as error:
-        used = f"no: {in_one_line(error)}"
+    reason = cache_folder.why_not_cached()
     rows = [
         ["place", f"{folder}"],
         ["traced programs", f"{len(traced)} ({_megabytes(traced)})"],
         ["compiled programs", f"{len(compiled)} ({_megabytes(compiled)})"],
-        ["used", used],
+        ["used", f"no: {reason}" if reason else "yes"],
     ]
     show(wrapped(rows, max(len(cell) for row in rows for cell in row) + 100))
     return 0

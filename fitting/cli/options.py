@@ -60,7 +60,7 @@ def command(*options: Option, name: str = "", needs_jax: bool = True) -> Callabl
 
 
 def compiled(call: Call) -> Call:
-    """The call with 64-bit floats, and with its compiled programs kept for later commands."""
+    """The call with 64-bit floats, and with its compiled programs cached for later commands."""
 
     @functools.wraps(call)
     def run(options: argparse.Namespace) -> int:

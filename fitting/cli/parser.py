@@ -31,7 +31,7 @@ EXAMPLES = """examples:
   jaxik record to-toml footik.bin -o footik.toml
   jaxik export runs/walk --as unreal -o walk.csv               in a game engine's names and units
   jaxik bench --quick
-  jaxik cache                                                  where compiled programs are kept
+  jaxik cache                                                  where compiled programs are cached
   jaxik parameters stride                                      what each one is and does
   jaxik schema                                                 all keys of an experiment file
   jaxik example uneven_walk -o walk                            an experiment to begin with

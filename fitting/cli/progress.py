@@ -1,4 +1,4 @@
-"""Ctrl-C that is never lost while a search or a sampling goes on."""
+"""Ctrl-C during a search or a sampling, of which none is lost."""
 
 import signal
 import threading

@@ -46,10 +46,10 @@ def examine() -> Finding:
         "derivatives are 0 or not finite": not (np.isfinite(slopes).all() and slopes.any()),
         f"the fit found {FREE} = {value:.4g}, wanted {true_value:g}": not error < LARGEST_ERROR,
     }
-    problems_found = [text for text, is_wrong in wrong.items() if is_wrong]
+    differences = [text for text, is_wrong in wrong.items() if is_wrong]
     seconds = time.perf_counter() - begin
     fact = f"motion, derivatives and a fit ({FREE} = {value:.4g}) in {seconds:.0f} s"
-    return Finding("self-test", fact, "; ".join(problems_found), WRONG_NUMBERS)
+    return Finding("self-test", fact, "; ".join(differences), WRONG_NUMBERS)
 
 
 def _experiment() -> tuple[Experiment, float]:

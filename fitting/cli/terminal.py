@@ -25,16 +25,16 @@ console_in_use: "ContextVar[Console | None]" = ContextVar("console_in_use", defa
 PATIENCE = 1.5  # s, after which work is announced; what is shorter says nothing
 INTERVAL = 10.0  # s between reports of what goes on
 SILENCE = 60.0  # s, the longest time without a line
-TICK = 0.2  # s between looks at the clock
+TICK = 0.2  # s between updates
 
 
 @contextmanager
 def watched() -> Iterator[None]:
     """Shows the work of this context: with bars on a terminal, elsewhere in plain lines."""
-    # Where results go to a terminal, too, it is the same one, and one console keeps them apart.
+    # Results that go to a terminal, too, go to the same one: one console separates both.
     console = None
     if sys.stderr is None:  # it was closed
-        with activity.watched_by(Shown()):
+        with activity.watched_by(LogPrinter()):
             yield
         return
     if make_console(sys.stderr) is not None:
@@ -99,7 +99,7 @@ def show_help(text: str) -> None:
     draw_help(console, text)
 
 
-class Shown(activity.Watcher):
+class LogPrinter(activity.Watcher):
     """Prints what is logged, and shows nothing of work."""
 
     def logged(self, text: str) -> None:
@@ -107,12 +107,11 @@ class Shown(activity.Watcher):
         show(text)
 
 
-class PlainLines(Shown):
+class PlainLines(LogPrinter):
     """Announces work that takes longer than a moment, and reports on it now and then.
 
-    Work within other work that has been announced once under the same title is only reported on: a
-    study of a thousand fits prints no thousand announcements. Another thread looks at the clock,
-    since what takes long cannot.
+    Inner work is announced once for each title, so that a study of a thousand fits does not print a
+    thousand announcements. Another thread watches the clock, since the one that works cannot.
     """
 
     def __init__(self, stream: "TextIO | _Stream"):
@@ -120,7 +119,7 @@ class PlainLines(Shown):
         self._lock = threading.RLock()
         self._going_on: list[Work] = []
         self._announced: set[int] = set()
-        """Of the work that is going on, the depths."""
+        """Depths of the work that is going on."""
         self._titles: set[str] = set()
         self._last = time.monotonic()
         self._closed = threading.Event()
@@ -160,7 +159,7 @@ class PlainLines(Shown):
                 self._announced.discard(depth)
                 self._print(ending(work))
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Announces what has been going on for a while; breaks a long silence."""
         with self._lock:
             for depth, work in enumerate(self._going_on):
@@ -176,10 +175,10 @@ class PlainLines(Shown):
 
     def _watch(self) -> None:
         while not self._closed.wait(TICK):
-            self.look()
+            self.update()
 
     def _report(self) -> None:
-        """Prints how far each work is of those that go on."""
+        """Prints how far each work that goes on has come."""
         with self._lock:
             words = [text for work in self._going_on if (text := describe(work))]
             if words and self._going_on:

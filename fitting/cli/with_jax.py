@@ -1,11 +1,10 @@
-"""What needs JAX: devices, XLA flags, kept programs and the self-test.
+"""What needs JAX: devices, XLA flags, cached programs and the self-test.
 
 A process of its own, which prints a finding in each line: `python -m fitting.cli.with_jax`.
 """
 
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 from fitting.cli import jax_start
 from fitting.runtime import xla
@@ -25,26 +24,25 @@ def examine(*, quick: bool) -> Iterator[Finding]:
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     yield Finding("devices", ", ".join(devices))
     yield Finding("XLA flags", xla.describe_flags())
-    yield _kept_programs()
+    yield _cached_programs()
     if not quick:
         from . import self_test
 
         yield self_test.examine()
 
 
-def _kept_programs() -> Finding:
-    """Where programs are kept, and how many."""
+def _cached_programs() -> Finding:
+    """Where programs are cached, and how many."""
     from fitting.runtime import cache_folder
 
     cache_folder.use_default()
-    folder = Path(str(cache_folder.setting(cache_folder.FOLDER) or cache_folder.default()))
-    kept = cache_folder.kept_programs(folder)
-    size = sum(path.stat().st_size for path in (*kept.traced, *kept.compiled)) / 1e6
-    fact = f"{len(kept.traced)} traced and {len(kept.compiled)} compiled, {size:.1f} MB, {folder}"
-    try:
-        cache_folder.traced()
-    except (cache_folder.SwitchedOffError, OSError) as error:
-        problem = f"programs are not kept, so that every command compiles anew: {error}"
+    folder = cache_folder.used_folder()
+    programs = cache_folder.cached_programs(folder)
+    size = sum(path.stat().st_size for path in (*programs.traced, *programs.compiled)) / 1e6
+    counts = f"{len(programs.traced)} traced and {len(programs.compiled)} compiled"
+    fact = f"{counts}, {size:.1f} MB, {folder}"
+    if reason := cache_folder.why_not_cached():
+        problem = f"programs are not cached, so that every command compiles anew: {reason}"
         remedy = "set XDG_CACHE_HOME to a folder of your own, and unset JAX's settings for a cache"
         return Finding("programs", fact, problem, remedy)
     return Finding("programs", fact)

@@ -110,7 +110,7 @@ class Work:
 
 
 class Watcher:
-    """Is told of all work, in the thread that does it; work within other work ends before it."""
+    """Its methods are called in the thread that works; work within other work ends before it."""
 
     def began(self, work: Work) -> None:
         """Called before the work begins."""

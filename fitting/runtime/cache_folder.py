@@ -1,4 +1,4 @@
-"""The folder in which programs are kept between processes: where it is, and what lies in it.
+"""The folder in which programs are cached between processes: where it is, and what lies in it.
 
 It is JAX's folder for compiled programs, with one inside it for the traced ones. JAX (0.10.2 to
 0.12.0.1) writes a compiled program in place, and never again once it is there. A process that reads
@@ -32,22 +32,22 @@ SUFFIX = "-cache"  # of the files' names
 
 
 class SwitchedOffError(Exception):
-    """Traced programs are not to be kept, by JAX's settings; the message names one."""
+    """JAX's settings say that no traced programs are cached; the message names one."""
 
 
-class KeptPrograms(NamedTuple):
-    """The files of kept programs."""
+class CachedPrograms(NamedTuple):
+    """The files of cached programs."""
 
     traced: list[Path]
     compiled: list[Path]
 
 
 def use_default() -> None:
-    """Has JAX keep compiled programs in the user's cache folder, unless it was told where.
+    """Has JAX cache compiled programs in the user's cache folder, unless a setting names another.
 
-    Warns, and has nothing kept, where that folder belongs to somebody else or cannot be made:
-    JAX would run what it finds there. In any folder, JAX then writes its files completely or not
-    at all (`write_complete_files`).
+    Warns, and caches nothing, where that folder belongs to somebody else or cannot be made: JAX
+    would run what it finds there. In any folder, JAX then writes its files completely or not at
+    all (`write_complete_files`).
     """
     write_complete_files()
     if setting(FOLDER) is not None:
@@ -56,7 +56,7 @@ def use_default() -> None:
         folder = default()
         _make_own(folder)
     except (OSError, RuntimeError) as error:
-        warn_once("programs are not kept between calls", in_one_line(error))
+        warn_once("programs are not cached between calls", in_one_line(error))
         return
     jax.config.update(FOLDER, str(folder))
     if MIN_SECONDS.upper() not in os.environ:
@@ -64,10 +64,10 @@ def use_default() -> None:
 
 
 def default() -> Path:
-    """`jaxik` in the folder where this platform keeps caches, or in `XDG_CACHE_HOME`."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(given):  # others are to be ignored, says the specification
-        return Path(given, "jaxik")
+    """`jaxik` in this platform's folder for caches, or in `XDG_CACHE_HOME`."""
+    folder = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(folder):  # the specification says to ignore others
+        return Path(folder, "jaxik")
     if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
         return Path(local, "jaxik", "Cache")
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "jaxik"
@@ -77,7 +77,7 @@ def traced() -> Path:
     """The user's own folder for traced programs, made if missing.
 
     Raises:
-        SwitchedOffError: none are to be kept, by JAX's settings.
+        SwitchedOffError: JAX's settings say that none are cached.
         OSError: the folder cannot be made, or is not safe from others.
     """
     folder = setting(FOLDER)
@@ -86,9 +86,9 @@ def traced() -> Path:
     if not setting(ENABLED):
         raise SwitchedOffError(f"{ENABLED} is off")
     if "://" in str(folder):
-        raise SwitchedOffError(f"traced programs are kept on this machine only, not in {folder}")
+        raise SwitchedOffError(f"traced programs are cached on this machine only, not in {folder}")
     if jax.device_count() > 1:
-        raise SwitchedOffError(f"there are {jax.device_count()} devices; one's programs are kept")
+        raise SwitchedOffError(f"there are {jax.device_count()} devices; programs are for one")
     path = Path(str(folder), TRACED)
     _make_own(path)
     return path
@@ -106,10 +106,24 @@ def check_own(path: Path, status: os.stat_result) -> None:
         raise PermissionError(f"everybody may write to {path}")
 
 
-def kept_programs(folder: Path) -> KeptPrograms:
+def cached_programs(folder: Path) -> CachedPrograms:
     """The user's own files of programs in a folder, and no others."""
     traced, compiled = _files(folder / TRACED, TRACED_NAMES), _files(folder, COMPILED_NAMES)
-    return KeptPrograms(list(traced), list(compiled))
+    return CachedPrograms(list(traced), list(compiled))
+
+
+def used_folder() -> Path:
+    """The folder of JAX's setting, or the default."""
+    return Path(str(setting(FOLDER) or default()))
+
+
+def why_not_cached() -> str:
+    """Why no traced programs are cached, in a line; empty if they are."""
+    try:
+        traced()
+    except (SwitchedOffError, OSError) as error:
+        return in_one_line(error)
+    return ""
 
 
 def setting(name: str) -> object:
@@ -158,7 +172,7 @@ def write_complete_files() -> None:
     in_place = LRUCache.put
 
     def put(self: LRUCache, key: str, value: bytes) -> None:
-        """Keeps a compiled program, which JAX offers only if it could not read it."""
+        """Caches a compiled program, which JAX offers only if it could not read it."""
         if self.eviction_enabled or "://" in str(self.path):
             in_place(self, key, value)
         else:

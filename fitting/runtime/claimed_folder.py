@@ -18,7 +18,7 @@ from typing import IO
 from .validation import error_context
 
 LOCK = ".jaxik.lock"
-LONGEST_COMMAND = 100  # characters of it that the file keeps
+LONGEST_COMMAND = 100  # characters of it, in the file
 
 
 class InUseError(ValueError):

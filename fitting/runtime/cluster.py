@@ -3,10 +3,10 @@
 Dask schedules them, notices workers that die, and gives their calls to others. Workers of this
 machine are spawned, never forked: a fork of a process in which JAX has started may hang.
 
-One process compiles what several need; the others of this machine wait until it is kept.
+One process compiles what several need; the others of this machine wait until it is cached.
 
 Processes that share a cache of programs would all compile the same ones if they began at once.
-Which programs a process has kept is noted beside them, so that later ones need not wait. A lock
+Which programs a process has cached is noted beside them, so that later ones need not wait. A lock
 ends with its process, also a killed one.
 """
 
@@ -83,7 +83,7 @@ def connect(
         options: dict[str, Any] = {
             "threads_per_worker": 1,
             "dashboard_address": DASHBOARD if dashboard and has_dashboard() else None,
-            "silence_logs": logging.ERROR,  # a worker that dies is told by the job
+            "silence_logs": logging.ERROR,  # the job reports a worker that dies
             "env": _environment(),
         }
         with _workers_without_interrupts():
@@ -133,10 +133,10 @@ def compute(
 ) -> "Iterator[tuple[int, Future]]":
     """The index of each argument and the function's finished future for it, as they finish.
 
-    The function travels to each worker once, with all that it holds; its arrays keep their 64 bits.
+    The function travels to each worker once, with all that it holds; its arrays stay at 64 bits.
     A call's error is raised by `result()` of its future. Calls of a worker that dies are made by
     others; after the fourth death at one call, its error is `KilledWorker`. However many arguments
-    there are, the scheduler knows of as many calls as keep its workers busy.
+    there are, the scheduler gets no more calls than its workers need to stay busy.
     """
     import cloudpickle
     from distributed import as_completed
@@ -172,7 +172,7 @@ def _cores(client: "Client") -> list[int]:
 
 
 def _environment() -> dict[str, str]:
-    """What makes workers of this machine compute, and keep programs, as this process does."""
+    """What makes workers of this machine compute, and cache programs, as this process does."""
     names = (cache_folder.FOLDER, cache_folder.ENABLED, cache_folder.MIN_SECONDS)
     settings = {name.upper(): cache_folder.setting(name) for name in names}
     return (
@@ -266,7 +266,7 @@ class Stopwatch:
 def first_alone(key: str) -> Iterator[None]:
     """Keeps other processes of this machine waiting as long as the first one with this key is here.
 
-    Nobody waits where programs are not kept.
+    Nobody waits where programs are not cached.
 
     Args:
         key: 64 hexadecimal digits, the same for processes that need the same programs.
@@ -276,14 +276,14 @@ def first_alone(key: str) -> Iterator[None]:
     except (cache_folder.SwitchedOffError, OSError):
         yield
         return
-    kept = folder / f"kept-{key}"
+    finished = folder / f"kept-{key}"
     with ExitStack() as stack:
-        if not kept.exists():
+        if not finished.exists():
             stack.enter_context(waiting_for(folder / f"first-{key}"))
-        if kept.exists():
-            stack.close()  # another process has kept them meanwhile
+        if finished.exists():
+            stack.close()  # another process has cached them meanwhile
         yield
-        kept.touch()
+        finished.touch()
 
 
 @contextmanager

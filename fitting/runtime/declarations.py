@@ -231,8 +231,9 @@ def check_table(value: object, known: Mapping[str, Key], where: str) -> Content:
         where: the table's place in its file, for the error message: "walk.toml [fit]".
 
     Raises:
-        ValueError: it is no table, lacks a key that is needed, has an unknown one, or a value that
-            is not accepted; the message says what came, what was wanted, and which keys there are.
+        ValueError: it is not a table, lacks a key that is needed, or has an unknown one or a value
+            that is not accepted; the message says what came, what was wanted, and which keys there
+            are.
     """
     if not isinstance(value, Mapping):
         raise ValueError(f"{where} is {value!r}; wanted a table, such as {{}}")
@@ -289,7 +290,7 @@ def closed(properties: Mapping[str, Content], patterns: Mapping[str, Content] = 
 
     Args:
         properties: schemas of the values, by key.
-        patterns: likewise, by pattern of further keys.
+        patterns: schemas of further keys, by pattern.
     """
     schema = {"type": "object", "properties": properties, "additionalProperties": False}
     return schema | {"patternProperties": patterns} if patterns else schema

@@ -135,7 +135,7 @@ def _sweep_first_release(path: Path) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether a process runs on this machine; where that cannot be asked, it may."""
+    """Whether a process runs on this machine; where the system does not say, it may."""
     if sys.platform == "win32":  # there os.kill ends the process, whatever the signal
         return True
     try:

@@ -56,7 +56,7 @@ PLAIN = {
 
 @dataclasses.dataclass(frozen=True)
 class JsonFile(Generic[Stored]):
-    """A kind of JSON file: what it holds, and what to tell a user whose file holds something else.
+    """A kind of JSON file: what it holds, and what a user reads whose file holds something else.
 
     The declared content is a `TypedDict` or a dataclass.
     """
@@ -235,7 +235,7 @@ def _inside(where: str, key: str) -> str:
 def _wanted(accepted: bool, value: Any, description: str, where: str) -> Any:
     """The value, or a ValueError that says where it stands and what was wanted there."""
     if not accepted:
-        shown = repr(value)
-        shown = shown if len(shown) <= 40 else f"{shown[:37]}..."
-        raise ValueError(f"{where or 'it'} is {shown}; wanted {description}")
+        text = repr(value)
+        text = text if len(text) <= 40 else f"{text[:37]}..."
+        raise ValueError(f"{where or 'it'} is {text}; wanted {description}")
     return value

@@ -56,7 +56,7 @@ def rebuild(description: Json) -> object:
     """The tree that a description was made from; functions and classes are not read back.
 
     Raises:
-        ValueError: this is no description, or it names a class that may not be read.
+        ValueError: this is not a description, or it names a class that may not be read.
     """
     match description:
         case None | bool() | int() | float() | str():
@@ -79,7 +79,7 @@ def _path(named: Any) -> str:
     """Where a class or function is found by its name.
 
     Raises:
-        NotPlainError: it is not, or its source is the user's, who may change it and keep the name.
+        NotPlainError: it is not, or its source is the user's and may change under this name.
     """
     module, name = named.__module__, named.__qualname__
     if str(module).partition(".")[0] not in NAMED or _lookup(module, name) is not named:
@@ -97,21 +97,21 @@ def _lookup(module: str, name: str) -> object:
 
 def _find_class(path: str) -> type:
     module, _, name = path.partition(":")
-    found = _lookup(module, name)
-    if module.partition(".")[0] not in READ or not isinstance(found, type):
-        raise ValueError(f"{path} is no class of {', '.join(sorted(READ))}")
-    return found
+    named = _lookup(module, name)
+    if module.partition(".")[0] not in READ or not isinstance(named, type):
+        raise ValueError(f"{path} is not a class of {', '.join(sorted(READ))}")
+    return named
 
 
 def _new_namedtuple(cls: type, items: list[object]) -> object:
     if not _is_namedtuple(cls) or len(items) != len(cls._fields):  # type: ignore[attr-defined]
-        raise ValueError(f"{cls.__qualname__} is no named tuple of {len(items)} items")
+        raise ValueError(f"{cls.__qualname__} is not a named tuple of {len(items)} items")
     return tuple.__new__(cls, items)
 
 
 def _new_object(cls: type, values: dict[str, object]) -> object:
     if not dataclasses.is_dataclass(cls) or set(values) != set(_field_names(cls)):
-        raise ValueError(f"{cls.__qualname__} is no dataclass of the fields {sorted(values)}")
+        raise ValueError(f"{cls.__qualname__} is not a dataclass of the fields {sorted(values)}")
     instance = object.__new__(cls)
     for name, value in values.items():
         object.__setattr__(instance, name, value)

@@ -1,7 +1,7 @@
 """64-bit floats where a fit needs them, whatever JAX is set to for everybody else.
 
 JAX has 32-bit floats unless its 64-bit types are enabled, for a whole process or in a context. What
-belongs to a fit enables them for its own calls only; arrays that come out keep their 64 bits.
+belongs to a fit enables them for its own calls only; arrays that come out stay at 64 bits.
 """
 
 import functools

@@ -1,10 +1,8 @@
-"""Traced programs kept on disk beside the compiled ones, so that the next process need not trace.
+"""Traced programs cached on disk beside the compiled ones, so that the next process need not trace.
 
 JAX's own cache finds compiled code by the text of a program, and has to trace to get that text; for
-a fit, tracing takes longer than the search. Here the text itself is kept, in a file that is
-named after its `program_key`.
-
-Files of traced programs.
+a fit, tracing takes longer than the search. Here the text itself is cached, in a file that is
+named after its `program_key`:
 
     jaxik program 1                  format and its version, in a line
     {"key": ..., "versions": ...}    header, JSON in a line
@@ -195,19 +193,19 @@ def sources() -> str:
 
 
 class _Place(NamedTuple):
-    """Where a program is kept, and its key."""
+    """Where a program is cached, and its key."""
 
     path: Path
     key: str
 
 
 def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
-    """`equinox.filter_jit` that also keeps the traced program, wherever JAX keeps compiled ones.
+    """`equinox.filter_jit` that also caches the traced program, wherever JAX caches compiled ones.
 
-    Arrays among the arguments are traced; everything else is static. A program is kept only if all
-    static arguments come from this project or its libraries: a user's function may change and keep
-    its name. A failure to keep or to read one is a warning, once, and the call goes on. Called
-    inside another traced program, this is plain `filter_jit`.
+    Arrays among the arguments are traced; everything else is static. A program is cached only if
+    all static arguments come from this project or its libraries: a user's function may change under
+    the same name. A failure to write or to read one is a warning, once, and the call goes on.
+    Called inside another traced program, this is plain `filter_jit`.
     """
 
     name = function.__name__.strip("_").replace("_", " ")
@@ -228,7 +226,7 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
                 _write(place, program)
         if program is None:
             output = function(*args, **named)  # raises the error if the call itself is wrong
-            warn_once(f"the program of {function.__name__} is not kept", failure)
+            warn_once(f"the program of {function.__name__} is not cached", failure)
             return output
         return program.call(jax.tree.leaves(eqx.filter(arguments, eqx.is_array)))
 
@@ -254,9 +252,9 @@ def committed(tree: Tree) -> Tree:
     """The tree with its arrays committed to the one device they are on.
 
     JAX compiles a program anew for arrays that are committed to a device, which those that come out
-    of a kept program are and most others are not. A program that is cached commits its arguments
-    itself, but for several hundred arrays that takes longer than many a call; what goes into many
-    calls is committed before. Arrays on several devices stay as they are.
+    of a cached program are and most others are not. Such a program commits its arguments itself,
+    but for several hundred arrays that takes longer than many a call; what goes into many calls is
+    committed before. Arrays on several devices stay as they are.
     """
     leaves, structure = jax.tree.flatten(tree)
     arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
@@ -270,14 +268,14 @@ def committed(tree: Tree) -> Tree:
 
 
 def _place(function: Callable, arguments: Arguments) -> _Place | None:
-    """Where the program for arguments of these types is kept; None if it must not be."""
+    """Where the program for arguments of these types is cached; None if it must not be."""
     try:
         folder = cache_folder.traced()
         key = program_key(function, arguments)
     except (cache_folder.SwitchedOffError, NotPlainError):
         return None
     except OSError as error:
-        warn_once("traced programs are not kept", in_one_line(error))
+        warn_once("traced programs are not cached", in_one_line(error))
         return None
     return _Place(folder / f"{function.__name__}-{key}", key)
 
@@ -286,7 +284,7 @@ def _read(place: _Place) -> Program | None:
     try:
         return read(place.path, place.key, versions())
     except (OSError, ValueError) as error:
-        warn_once("a kept program is traced anew", in_one_line(error))
+        warn_once("a cached program is traced anew", in_one_line(error))
         return None
 
 
@@ -294,7 +292,7 @@ def _write(place: _Place, program: Program) -> None:
     try:
         write(place.path, program, place.key, versions())
     except (OSError, ValueError, NotPlainError) as error:
-        warn_once("traced programs are not kept", in_one_line(error))
+        warn_once("traced programs are not cached", in_one_line(error))
 
 
 def _trace(function: Callable, arguments: Arguments) -> Program:

@@ -27,7 +27,7 @@ class Store(Generic[Result]):
     """What a file with another key is, in words: `{changed}` names the entries that differ, and any
     other name in braces is that of an entry."""
     check: Callable[[Result], object] = lambda result: None
-    """Raises ValueError for a result that contradicts itself or what is asked."""
+    """Raises ValueError for a result that contradicts itself or the request."""
 
     def remember(self, name: str, compute: Callable[[], Result], key: Table = NO_KEY) -> Result:
         """The stored result, or a new one, which is stored.

@@ -51,7 +51,7 @@ NEEDED = {
 # Names of mallopt's parameters, from malloc.h of the GNU C library.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 ARRAY = 32 << 20  # bytes; a larger array gets pages of its own, which go back when it is freed
-KEPT = 128 << 20  # bytes at the end of the heap that stay with the process
+SPARE = 128 << 20  # bytes at the end of the heap that stay with the process
 OF_USER = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES")
 
 
@@ -60,12 +60,12 @@ def configure_xla() -> None:
 
     Only flags that the installed jaxlib is known to accept are set; with a version that is newer
     than this package there may be none, and everything works, slower. Flags in the environment
-    variable `XLA_FLAGS` are kept and take precedence; where it is empty or names a file, no flags
+    variable `XLA_FLAGS` stay and take precedence; where it is empty or names a file, no flags
     are added.
 
     Programs also run in the thread that calls them, unless `JAX_CPU_ENABLE_ASYNC_DISPATCH` says
     otherwise: waking another thread, as JAX does by default, takes as long as computing one frame
-    of one character. And memory of arrays that were freed is kept for new ones
+    of one character. And memory of arrays that were freed stays for new ones
     (`keep_freed_memory`).
     """
     import jax  # takes half a second, which `jaxik --help` should not spend
@@ -118,7 +118,7 @@ def keep_freed_memory() -> bool:
     By default the GNU C library returns the memory of large arrays to the system, and each call of
     a program writes its results to new pages. The system clears a page when it is first written
     to, which took 40 % of the time of feet and up to a quarter of that of legs (AMD EPYC, in a
-    virtual machine). A process keeps at most `KEPT` bytes more for it. Another C library, and what
+    virtual machine). A process holds at most `SPARE` bytes more for it. Another C library, and what
     the user set in an environment variable, is left alone.
     """
     if any(name in os.environ for name in OF_USER):
@@ -127,4 +127,4 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # not the GNU C library; on Windows there is none
         return False
-    return bool(mallopt(M_MMAP_THRESHOLD, ARRAY) and mallopt(M_TRIM_THRESHOLD, KEPT))
+    return bool(mallopt(M_MMAP_THRESHOLD, ARRAY) and mallopt(M_TRIM_THRESHOLD, SPARE))

@@ -216,7 +216,7 @@ class Clock:
         """Lets time pass; the lines that came since it was last asked."""
         for _ in range(round(seconds * 10)):
             self.now += 0.1
-            self.lines.look()
+            self.lines.update()
         text = self._stream.getvalue()
         self._stream.seek(0)
         self._stream.truncate()

@@ -1,4 +1,4 @@
-"""The folder of kept programs: where it is, whose it must be, what counts as a program, and what
+"""The folder of cached programs: where it is, whose it must be, what counts as a program, and what
 commands say of it."""
 
 import os
@@ -80,7 +80,7 @@ def test_a_default_folder_that_is_not_safe_is_not_used_by_jax_either(caches, mon
 
     def assert_unused(reason: str) -> None:
         cache_folder.WARNED.clear()
-        with pytest.warns(RuntimeWarning, match=f"programs are not kept between calls: {reason}"):
+        with pytest.warns(RuntimeWarning, match=f"programs are not cached between calls: {reason}"):
             cache_folder.use_default()
         assert setting(FOLDER) is None
 
@@ -119,7 +119,7 @@ def test_the_reason_for_keeping_nothing_names_the_setting(tmp_path, monkeypatch)
         cache_folder.traced()
 
 
-def test_only_kept_programs_of_this_user_count_as_such(tmp_path, monkeypatch):
+def test_only_cached_programs_of_this_user_count_as_such(tmp_path, monkeypatch):
     kept, half = f"jit_step-{DIGEST}", ".jaxik-vm-7-x_1ab"  # half-written, as is x_1ab
     names = [f"run-{DIGEST}", f"_evaluate-{DIGEST}", f".run-{DIGEST}x_1ab", f".run-{DIGEST}{half}"]
     traced = [tmp_path / TRACED / name for name in names]
@@ -132,10 +132,10 @@ def test_only_kept_programs_of_this_user_count_as_such(tmp_path, monkeypatch):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     (tmp_path / TRACED / f"link-{DIGEST}").symlink_to(others[0])
-    assert cache_folder.kept_programs(tmp_path) == (sorted(traced), sorted(compiled))
-    assert cache_folder.kept_programs(tmp_path / "none") == ([], [])
+    assert cache_folder.cached_programs(tmp_path) == (sorted(traced), sorted(compiled))
+    assert cache_folder.cached_programs(tmp_path / "none") == ([], [])
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
-    assert cache_folder.kept_programs(tmp_path) == ([], [])
+    assert cache_folder.cached_programs(tmp_path) == ([], [])
 
 
 # What commands say
@@ -184,7 +184,7 @@ def test_clear_removes_the_programs_and_nothing_else(folder, capsys):
 def test_what_cannot_be_kept_is_said_once_and_in_one_line(folder, monkeypatch, capsys):
     folder.chmod(0o777)
     assert main.main(["cache"]) == 0
-    expected = f"jaxik: programs are not kept between calls: everybody may write to {folder}\n"
+    expected = f"jaxik: programs are not cached between calls: everybody may write to {folder}\n"
     assert capsys.readouterr().err == expected
 
     def warn(_):

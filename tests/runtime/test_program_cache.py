@@ -1,4 +1,4 @@
-"""Programs kept between processes: the same output, traced once; JAX's own files are whole."""
+"""Programs cached between processes: the same output, traced once; JAX's own files are whole."""
 
 import errno
 import functools
@@ -217,7 +217,7 @@ def test_a_folder_of_another_user_is_neither_read_nor_written_which_is_said_once
 ):
     fresh()(2.0, points())
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
-    with pytest.warns(RuntimeWarning, match="not kept: .*traced belongs to another user") as said:
+    with pytest.warns(RuntimeWarning, match="not cached: .*traced belongs to another user") as said:
         for count in (4, 5):
             fresh()(2.0, points(count))
     assert len(said) == 1
@@ -235,25 +235,25 @@ def test_a_full_disk_and_a_file_in_the_place_of_the_folder_are_said_once(folder,
     expected = eqx.filter_jit(stretch)(2.0, points())
     with monkeypatch.context() as patch:
         patch.setattr(files.tempfile, "mkstemp", fail)
-        with pytest.warns(RuntimeWarning, match="not kept: .*No space left on device") as said:
+        with pytest.warns(RuntimeWarning, match="not cached: .*No space left on device") as said:
             assert_same(fresh()(2.0, points()), expected)
             fresh()(2.0, points(5))
     assert len(said) == 1 and not kept(folder)
     folder.rmdir()
     cache_folder.WARNED.clear()
     folder.write_text("a file in its place")
-    with pytest.warns(RuntimeWarning, match="traced programs are not kept: .*File exists"):
+    with pytest.warns(RuntimeWarning, match="traced programs are not cached: .*File exists"):
         assert_same(fresh()(2.0, points()), expected)
     assert folder.read_text() == "a file in its place"
 
 
 def test_what_cannot_be_kept_or_exported_is_returned_all_the_same(folder, monkeypatch):
-    with pytest.warns(RuntimeWarning, match="not kept: frozenset is neither"):
+    with pytest.warns(RuntimeWarning, match="not cached: frozenset is neither"):
         output = program_cache.cached(as_set)(points())
     assert output[1] == {"one"} and TRACED == [(4, 3)] and not kept(folder)
     refuse = Mock(side_effect=ValueError("Cannot serialize\nthis call"))
     monkeypatch.setattr(program_cache.export, "export", refuse)
-    with pytest.warns(RuntimeWarning, match="of stretch is not kept: Cannot serialize$"):
+    with pytest.warns(RuntimeWarning, match="of stretch is not cached: Cannot serialize$"):
         output = fresh()(2.0, points())
     np.testing.assert_allclose(output["half"][0], points() / 2)
 
