@@ -1,11 +1,11 @@
 """Whole jobs, from files to a folder with results and a report: what the command line runs.
 
 Each job checks everything the user gave before it computes anything, writes its results as soon as
-they exist, and draws its report last. Without an `output` nothing is written. How a job gets on,
-and the lines and tables that the command line prints, go to whoever watches: `runtime.activity`.
+they exist, and draws its report last. Without an `output` nothing is written. Progress,
+and the lines and tables that the command line prints, go to watchers: `runtime.activity`.
 
-Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
-bits; a system that was made in 32 bits is taken with the values it has there.
+Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays have 64
+bits; a system that was made in 32 bits is used with its values there.
 
 Each job stands with its study in `fitting.studies`; `view` and `view_run` stand in
 `fitting.viewer`.

@@ -19,7 +19,7 @@ from fitting.runtime.validation import Content, in_one_line
 
 from . import formatting, motion_data, pages, style
 from .formatting import JoinedText, Table, aligned, bullets, joined
-from .motion_data import ShownClip
+from .motion_data import ViewedClip
 
 STORED = "report.json"
 
@@ -141,7 +141,7 @@ class Section(NamedTuple):
 class View:
     """The motion in 3-D, which only the page shows."""
 
-    clips: Sequence[ShownClip]
+    clips: Sequence[ViewedClip]
     names: Sequence[str]
     """Of the clips."""
     visible: str
@@ -170,8 +170,8 @@ class Document:
     findings: Sequence[Finding]
     """Every rendering begins with those that say what went badly."""
     sections: Sequence[Section]
-    asked: Table
-    """What was asked, a name and a text each."""
+    setup: Table
+    """What was run, and how: a name and a text each."""
     numbers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """The content of the JSON files that have all numbers, by file name."""
     files: Mapping[str, str] = field(default_factory=dict)
@@ -194,8 +194,8 @@ class Document:
 
     @property
     def whole(self) -> list[Section]:
-        """All sections, what was asked last."""
-        return [*self.sections, Section("What was asked", [Terms(self.asked)])]
+        """All sections, the setup last."""
+        return [*self.sections, Section("Setup", [Terms(self.setup)])]
 
     def write(self, folder: Path, *, stored: bool = False) -> None:
         """Draws the plots, and writes the numbers, and the document as Markdown and as a page.
@@ -234,7 +234,7 @@ class StoredDocument(TypedDict):
 
 
 STORED_FILE = JsonFile(StoredDocument, "a report", "delete it to go without", indent=None)
-PLAIN = ("file", "kind", "title", "verdict", "good", "asked", "files", "note")
+PLAIN = ("file", "kind", "title", "verdict", "good", "files", "note")
 
 
 def load(folder: Path) -> Document | None:
@@ -250,7 +250,7 @@ def load(folder: Path) -> Document | None:
 def _stored(document: Document, clips: Sequence[Content]) -> StoredDocument:
     view = document.view
     return {
-        "document": {name: getattr(document, name) for name in PLAIN},
+        "document": {name: getattr(document, name) for name in PLAIN} | {"asked": document.setup},
         "findings": [list(finding) for finding in document.findings],
         "sections": [
             [section.heading, list(map(_stored_block, section.blocks)), section.on_page]
@@ -272,9 +272,11 @@ def _stored_block(block: Block) -> list:
 
 
 def _restored(stored: StoredDocument) -> Document:
+    plain = dict(stored["document"])
     try:
         return Document(
-            **stored["document"],
+            setup=plain.pop("asked"),
+            **plain,
             findings=[Finding(*finding) for finding in stored["findings"]],
             sections=[
                 Section(heading, [_block(*block) for block in blocks], on_page)

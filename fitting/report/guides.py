@@ -93,7 +93,7 @@ class Parameter:
     """A fit goes no lower; None for what no fit changes."""
     high: float | None
     kind: str | None
-    """"smooth" or "threshold"; None likewise."""
+    """"smooth" or "threshold"; None for what no fit changes."""
     scale: str | None
     meaning: str
 

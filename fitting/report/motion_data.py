@@ -27,7 +27,7 @@ LARGEST = 32_767  # of a 16-bit integer
 HOLE = 65_535  # in place of a height, where there is no ground
 
 
-class Look(NamedTuple):
+class Appearance(NamedTuple):
     """How a skeleton is drawn."""
 
     colour: str
@@ -38,19 +38,19 @@ class Look(NamedTuple):
     """Below 1 it is a shell of glass."""
 
 
-ANIMATED = Look(style.SLIDING, 0.012)
-BEFORE = Look(style.BEFORE, 0.015)
-CAPTURED = Look(style.CAPTURED, 0.034, 0.1)  # around what should be inside it
-FITTED = Look(style.AFTER, 0.02)
+ANIMATED = Appearance(style.SLIDING, 0.012)
+BEFORE = Appearance(style.BEFORE, 0.015)
+CAPTURED = Appearance(style.CAPTURED, 0.034, 0.1)  # around what should be inside it
+FITTED = Appearance(style.AFTER, 0.02)
 
 
 @dataclass(frozen=True)
-class ShownMotion:
+class ViewedMotion:
     """A motion as the page shows it."""
 
     label: str
     motion: PlacedMotion
-    look: Look
+    appearance: Appearance
     visible: bool = False
     """At first; the legend shows and hides it."""
     worst: tuple[int, int] | None = None
@@ -58,10 +58,10 @@ class ShownMotion:
 
 
 @dataclass(frozen=True)
-class ShownClip:
+class ViewedClip:
     """What the page shows of one clip."""
 
-    motions: Mapping[str, ShownMotion]
+    motions: Mapping[str, ViewedMotion]
     """By a key that is the same in all clips."""
     stance: Bool[np.ndarray, "frames legs"]
     ground: GroundPatch
@@ -74,7 +74,7 @@ class ShownClip:
         return next(iter(self.motions.values())).motion
 
 
-def pack(clips: Sequence[ShownClip], spent: int = 0) -> list[dict[str, Any]]:
+def pack(clips: Sequence[ViewedClip], spent: int = 0) -> list[dict[str, Any]]:
     """All clips of a page, with so few frames and so coarse a ground that it stays small.
 
     Args:
@@ -90,11 +90,11 @@ def pack(clips: Sequence[ShownClip], spent: int = 0) -> list[dict[str, Any]]:
     ]
 
 
-def steps_between_frames(clips: Sequence[ShownClip], room: int = MAX_BYTES) -> list[int]:
+def steps_between_frames(clips: Sequence[ViewedClip], room: int = MAX_BYTES) -> list[int]:
     """How many frames of each clip make one on the page, for motions of so many bytes in all."""
     frames = [len(clip.stance) for clip in clips]
     steps = [max(1, math.ceil(clip.reference.clip.fps / MAX_RATE - 0.01)) for clip in clips]
-    sizes = [sum(_motion_bytes(shown.motion) for shown in clip.motions.values()) for clip in clips]
+    sizes = [sum(_motion_bytes(each.motion) for each in clip.motions.values()) for clip in clips]
     while sum(size / step for size, step in zip(sizes, steps, strict=True)) > room:
         if all(step >= count for step, count in zip(steps, frames, strict=True)):
             break  # one frame is left of each
@@ -122,7 +122,7 @@ def _motion_bytes(motion: PlacedMotion) -> int:
     return 2 * _points(motion).size + frames * (12 + legs)
 
 
-def _pack_clip(clip: ShownClip, ground: GroundPatch, step: int) -> dict[str, Any]:
+def _pack_clip(clip: ViewedClip, ground: GroundPatch, step: int) -> dict[str, Any]:
     reference = clip.reference.clip
     corner = np.append(ground.corner, _lowest(ground, clip.reference))[[0, 2, 1]]
     return {
@@ -134,19 +134,23 @@ def _pack_clip(clip: ShownClip, ground: GroundPatch, step: int) -> dict[str, Any
         "stance": _bytes(_any_of(clip.stance, step)),
         "watched": clip.watched,
         "skeletons": [
-            {"key": key, **_pack_look(shown, step), **_pack_motion(shown.motion, step, corner)}
-            for key, shown in clip.motions.items()
+            {
+                "key": key,
+                **_pack_appearance(viewed, step),
+                **_pack_motion(viewed.motion, step, corner),
+            }
+            for key, viewed in clip.motions.items()
         ],
         "ground": _pack_ground(ground, corner),
     }
 
 
-def _pack_look(shown: ShownMotion, step: int) -> dict[str, Any]:
-    worst = shown.worst
+def _pack_appearance(viewed: ViewedMotion, step: int) -> dict[str, Any]:
+    worst = viewed.worst
     return {
-        "label": shown.label,
-        **shown.look._asdict(),
-        "visible": shown.visible,
+        "label": viewed.label,
+        **viewed.appearance._asdict(),
+        "visible": viewed.visible,
         "worst": None if worst is None else {"start": worst[0] // step, "end": worst[1] // step},
     }
 

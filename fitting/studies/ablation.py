@@ -2,8 +2,8 @@
 
 Every clip is cut into parts. A variant is fitted on all parts but one and measured on that one, for
 each part in turn, at the clip's own rate; then it is fitted and measured on everything. The fit
-does not see the part that is held out, but its animation is still played: so feet keep their
-strides over the cuts, and all fits of a variant share their compiled programs. Each finished fit is
+does not see the part that is held out, but its animation is still played, so that feet have their
+strides over the cuts and all fits of a variant share their compiled programs. Each finished fit is
 written at once to `contribution.json`, from which an interrupted call continues.
 """
 
@@ -66,7 +66,7 @@ from .output import output_folder, publish
 NUMBERS = "contribution.json"
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
-SHOWN = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "lift_change")
+IN_BRIEF = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "lift_change")
 
 MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
 
@@ -106,10 +106,10 @@ class Row:
 
 
 class StoredRow(TypedDict):
-    """What a row's file holds in a way of its own; the rest is as `Row` declares it."""
+    """The fields of a row that its file holds in another form than `Row`."""
 
     agreement: dict[str, Finite | None]
-    """None for NaN, which JSON does not have."""
+    """None for NaN, which JSON lacks."""
     search: NotRequired[Content | None]
     """Rows of earlier versions lack it."""
 
@@ -211,12 +211,12 @@ def without(experiment: Experiment, ablation: Ablation) -> Experiment:
     """
     changed = replace(experiment, rules={**experiment.rules, **ablation.rules})
     # Names that neither system has stay, and are reported as mistakes later.
-    gone = set(leaf_names(experiment.preset_system())) - set(leaf_names(changed.preset_system()))
-    fixed = {name: value for name, value in experiment.parameters.items() if name not in gone}
+    missing = set(leaf_names(experiment.preset_system())) - set(leaf_names(changed.preset_system()))
+    fixed = {name: value for name, value in experiment.parameters.items() if name not in missing}
     free = {
         name: overrides
         for name, overrides in experiment.free.items()
-        if name.partition("[")[0] not in gone | set(ablation.parameters)
+        if name.partition("[")[0] not in missing | set(ablation.parameters)
     }
     return replace(
         changed, parameters={**fixed, **ablation.parameters}, free={**free, **ablation.free}
@@ -370,7 +370,7 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
 
 def row_text(row: Row) -> str:
     """A finished row in one line, for the terminal."""
-    figures = ", ".join(f"{ACCURACY[key].heading} {row.agreement.text(key)}" for key in SHOWN)
+    figures = ", ".join(f"{ACCURACY[key].heading} {row.agreement.text(key)}" for key in IN_BRIEF)
     return f"{row_name(row)}: {figures}; {row.seconds:.0f} s"
 
 
@@ -477,7 +477,7 @@ def document(experiment: Experiment, rows: Sequence[Row]) -> Document:
             ),
             _limits(rows, unconverged),
         ],
-        asked=[*pages.rows(experiment), ["Parts of each clip", f"{_parts(rows)}"]],
+        setup=[*pages.rows(experiment), ["Parts of each clip", f"{_parts(rows)}"]],
         files={CELLS: "all figures", NUMBERS: "all fits"},
     )
 

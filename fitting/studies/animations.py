@@ -5,7 +5,7 @@ How much the motion of a system depends on the frame rate at which it runs.
 Of an animation every second, third or so frame is played, as in a game that draws fewer frames, and
 the motion is compared with that of all frames where both have one. What the animation says of
 itself, its strides, contact labels and speeds, stays as it is at the animation's own rate: a game
-keeps it with the asset.
+stores it with the asset.
 """
 
 import dataclasses
@@ -121,7 +121,7 @@ class Animation:
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
     root: RootChoice = AS_ANIMATED
-    is_made: bool = False
+    is_synthetic: bool = False
     """Whether it has no noise, unlike a capture."""
     carried: Float64[np.ndarray, "frames 3"] | None = None
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
@@ -200,7 +200,7 @@ class Animation:
         """The bounds of what is made of it, by measure; see `measures.bounds`."""
         animated = self.placed_clip
         bounds = measures.bounds(animated, self._soles(animated))
-        return bounds if self.is_made else {k: v for k, v in bounds.items() if k not in NOISY}
+        return bounds if self.is_synthetic else {k: v for k, v in bounds.items() if k not in NOISY}
 
     def place(self, solved: Clip, result: jaxik.Result | None = None) -> PlacedMotion:
         """A motion on the ground, and what is measured of it.
@@ -223,7 +223,7 @@ class Animation:
         return likely_cause(soles, animated, unit=unit, trial=self._soles_without)
 
     def _soles_without(self, cause: Cause) -> Soles | None:
-        """The soles of the animation after the remedy for a cause; None where that is no remedy."""
+        """The soles of the animation after the remedy for a cause; None where there is none."""
         try:
             if cause.kind == "root" and self.root.rise is None:
                 _, choice = place_root(self.clip, self.terrain, "ground", self.floor)
@@ -239,7 +239,7 @@ class Animation:
     def own_speed(self) -> Clip:
         """The animation at its own speed, by which soles and slides are judged.
 
-        With a faster root its standing feet skate, which is to be measured and not to be excused.
+        With a faster root its standing feet skate, and measures must show that.
         """
         return at_speed(self.clip, 1.0 / self.speed)
 
@@ -319,7 +319,7 @@ class RateDifference:
     rms: Mapping[str, float]
     """m, over frames and legs, of each of `JOINTS`."""
     largest: Mapping[str, float]
-    """m, likewise."""
+    """m, of each of `JOINTS`."""
 
 
 @in_float64
@@ -353,7 +353,7 @@ def measure(
 
 
 def every_frame(animation: Animation, step: int) -> Animation:
-    """The animation of which only every so manyth frame is played."""
+    """The animation with every `step`-th frame only."""
     played, clip = slice(None, None, step), animation.clip
     own = jax.tree.map(lambda leaf: leaf[played], animation.frames)
     frames = dataclasses.replace(own, dt=own.dt * step)

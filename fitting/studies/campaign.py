@@ -48,9 +48,9 @@ class Campaign(Generic[Task, Row]):
     """By the index of their task."""
 
     def __post_init__(self) -> None:
-        self.look()
+        self.read_stored()
 
-    def look(self) -> None:
+    def read_stored(self) -> None:
         """Takes the rows that are stored."""
         for index in self.missing:
             if (row := self.read(self.tasks[index])) is not None:

@@ -46,7 +46,7 @@ from fitting.report.document import (
     View,
 )
 from fitting.report.formatting import Table, figures_table, listed, meanings, percent, transposed
-from fitting.report.motion_data import MAX_RATE, Look, ShownClip, ShownMotion
+from fitting.report.motion_data import MAX_RATE, Appearance, ViewedClip, ViewedMotion
 from fitting.report.style import (
     BEFORE,
     CAPTURED,
@@ -78,7 +78,7 @@ TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
 RATES = (
     "How far joints are from where they are at the clip's own rate: rms over frames and legs, and "
     "the largest distance. Labels, strides, speeds and root stay those at the clip's own rate, as "
-    "a game keeps them with the animation. Pelvis and feet of `unreal` and the pelvis of `mec` "
+    "a game stores them with the animation. Pelvis and feet of `unreal` and the pelvis of `mec` "
     "follow by the engine's interp-to, whose half-life depends on the frame rate, as in the "
     "originals: at a speed of 15 it is 33 ms at 30 Hz and 40 ms at 60 Hz."
 )
@@ -285,9 +285,9 @@ def rows(comparison: Comparison, names: Sequence[str]) -> Table:
     """The bounds, and these measures of all systems, with marks; a row each, its name first."""
     bounds = comparison.bounds
     limits = [MEASURES[name].limit(bounds[name]) if name in bounds else "" for name in names]
-    made = [[system, *_cells(comparison, system, names)] for system in comparison.motions]
+    measured = [[system, *_cells(comparison, system, names)] for system in comparison.motions]
     failed = [[system, *[f"none{MISS}" for _ in names]] for system in comparison.failures]
-    return [[BOUND, *limits], *made, *failed]
+    return [[BOUND, *limits], *measured, *failed]
 
 
 def _cells(comparison: Comparison, system: str, names: Sequence[str]) -> list[str]:
@@ -426,9 +426,7 @@ def _bars(
             textcoords="offset points",
             va="center",
         )
-    smallest = 10.0 ** (
-        1 - MEASURES[key].digits
-    )  # smallest axis: a value that rounds to 0 looks like 0
+    smallest = 10.0 ** (1 - MEASURES[key].digits)  # on whose axis what rounds to 0 looks like 0
     axes.set_xlim(0.0, 1.35 * max(*widths, smallest))
     axes.xaxis.set_visible(False)  # the values are at the bars
     axes.spines["bottom"].set_visible(False)
@@ -490,10 +488,10 @@ def document(comparison: Comparison) -> Document:
             _worst(comparison),
             _limits(comparison),
         ],
-        asked=_asked(comparison),
+        setup=_setup(comparison),
         numbers={NUMBERS: numbers(comparison)},
         view=View(
-            [shown(comparison, systems, watched=_worst_system(comparison))],
+            [viewed_clip(comparison, systems, watched=_worst_system(comparison))],
             [comparison.title],
             f"{100 * visible:.2g} cm",
         ),
@@ -555,7 +553,7 @@ def _limits(comparison: Comparison) -> Section:
     )
 
 
-def _asked(comparison: Comparison) -> Table:
+def _setup(comparison: Comparison) -> Table:
     animation = comparison.animation
     clip = animation.clip
     rows = [
@@ -659,7 +657,7 @@ def _reach(comparison: Comparison) -> Finding:
     return Finding(f"{text}; {unknown}.")
 
 
-def shown(comparison: Comparison, systems: tuple[str, ...], watched: str) -> ShownClip:
+def viewed_clip(comparison: Comparison, systems: tuple[str, ...], watched: str) -> ViewedClip:
     """What the view shows: colours are those of the plots.
 
     Args:
@@ -668,27 +666,28 @@ def shown(comparison: Comparison, systems: tuple[str, ...], watched: str) -> Sho
         watched: the one that is watched at first, if it gave a motion.
     """
     flat = motion_data.ANIMATED._replace(colour=BEFORE)
-    looks = {ANIMATED: flat} | {
-        name: Look(COLOURS[index % len(COLOURS)], RADIUS) for index, name in enumerate(systems)
+    appearances = {ANIMATED: flat} | {
+        name: Appearance(COLOURS[index % len(COLOURS)], RADIUS)
+        for index, name in enumerate(systems)
     }
     motions = {
-        key(name): ShownMotion(
+        key(name): ViewedMotion(
             "flat animation" if name == ANIMATED else name,
             motion,
-            looks[name],
+            appearances[name],
             visible=name != ANIMATED,
             worst=_window(comparison, name),
         )
         for name, motion in comparison.motions.items()
     }
     if comparison.captured is not None:
-        motions[CAPTURE] = ShownMotion(
+        motions[CAPTURE] = ViewedMotion(
             "captured", comparison.captured, motion_data.CAPTURED, visible=True
         )
     # Rays start above the highest motion, so that one inside a hill does not hide the hill.
     clips = [motion.clip for motion in comparison.motions.values()]
     highest = max(clips, key=lambda clip: float(clip.positions_ws[..., 1].max()))
-    return ShownClip(
+    return ViewedClip(
         motions,
         comparison.animated.clip.stance_labels(),
         ground_path.around_path(highest, comparison.animation.terrain),

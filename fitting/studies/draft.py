@@ -66,7 +66,7 @@ TOP = ("name", "preset", "faithful", "record_only", "body", "fps")  # that a dra
 
 
 class Assumption(NamedTuple):
-    """Something taken for granted."""
+    """An assumption about a clip."""
 
     topic: str
     text: str
@@ -185,7 +185,7 @@ def _base(data: ClipData, *, base_is_own: bool) -> Assumption:
 
 @dataclass(frozen=True)
 class DraftRequest:
-    """What there is to make an experiment of."""
+    """The files of which an experiment is made."""
 
     clips: tuple[Path, ...]
     """Captured."""
@@ -333,16 +333,16 @@ def draft(
     problem = problem_from_clips(replace(experiment, free=candidates), data)
     with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
         as_it_comes = playback.play_all(ik, problem.data)
-    apart = goodness.measure_distances(as_it_comes, as_it_comes)
+    distances = goodness.measure_distances(as_it_comes, as_it_comes)
     lines: list[str] = []
     if check.flat:
-        moved = _decisive(ik, problem, candidates) if apart.setbacks else []
+        moved = _decisive(ik, problem, candidates) if distances.setbacks else []
         forecasts = [
             Forecast(name, is_free=name in moved, reach=float(name in moved), contraction=0)
             for name in candidates
         ]
-        if apart.setbacks:
-            lines = [HARM.format(request.preset.name, describe_setback(apart.setbacks[0]))]
+        if distances.setbacks:
+            lines = [HARM.format(request.preset.name, describe_setback(distances.setbacks[0]))]
     else:
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
             forecasts = choose_free(problem.space.system, candidates, problem.data)
@@ -368,7 +368,7 @@ def draft(
         ),
         forecasts=tuple(forecasts),
         check=check,
-        distances=apart,
+        distances=distances,
         rig=rig,
     )
 
@@ -387,22 +387,22 @@ def _decisive(ik: jaxik.FootIK, problem: Problem[jaxik.FootIK], candidates: Free
 def _entry(request: DraftRequest, clip: Clip, index: int, ground: Ground | None) -> ClipEntry:
     start, end = (0.0, None) if request.bases else _motion(clip)
     path, base = request.clips[index], request.bases[index] if request.bases else None
-    taken = request.reading.of_file(path)
+    reading = request.reading.of_file(path)
     if base is not None:
-        taken = ClipOptions(**{**request.reading.of_file(base).given, **taken.given})
+        reading = ClipOptions(**{**request.reading.of_file(base).given, **reading.given})
     if ground is not None:
-        terrain, laid = ground.mesh, TerrainOptions()
+        terrain, terrain_reading = ground.mesh, TerrainOptions()
     else:
         terrain = request.terrains[index if len(request.terrains) > 1 else 0]
-        laid = request.terrain_reading
+        terrain_reading = request.terrain_reading
     return ClipEntry(
         reference=path,
         terrain=terrain,
         base=base,
         start=start,
         end=end,
-        **vars(taken),
-        **vars(laid),
+        **vars(reading),
+        **vars(terrain_reading),
     ).with_paths(Path.resolve)
 
 
@@ -437,7 +437,7 @@ def document(draft: Draft) -> Document:
         good=bool(free),
         findings=findings,
         sections=[Section("The clips", assumed), Section("As it comes", as_it_comes)],
-        asked=pages.rows(experiment),
+        setup=pages.rows(experiment),
     )
 
 
@@ -464,7 +464,7 @@ def as_toml(draft: Draft) -> str:
 
 
 def _plain_keys(properties: Content) -> Content:
-    """The keys of a table that are no tables themselves."""
+    """The keys of a table that are not tables themselves."""
     tables = ("object", "array")
     return {
         name: entry
@@ -504,7 +504,7 @@ def _meaning(entry: Content) -> str:
 
 
 def _of_clip(entry: ClipEntry, folder: Path) -> dict[str, Any]:
-    """The keys of a clip that are not as they are when left out."""
+    """The keys of a clip that differ from their defaults."""
     values = {}
     for name, default in vars(ClipEntry(Path(), Path())).items():
         value = getattr(entry, name)

@@ -62,12 +62,12 @@ def _rig(experiment: Experiment) -> jaxik.Rig | None:
 def _free(experiment: Experiment) -> Table:
     rig = _rig(experiment)
     ik = experiment.starting_system(rig)
-    shown = experiment.with_capture(ik)
-    declared = parameter_tree.declarations(shown)
+    system = experiment.with_capture(ik)
+    declared = parameter_tree.declarations(system)
     rows = [["free parameter", "value", "unit", "range", "meaning"]]
     for free in experiment.free_parameters(ik, rig):
         meaning = declared[free.leaf]
-        value = parameter_tree.shown(shown, free.leaf)
+        value = parameter_tree.shown(system, free.leaf)
         rows.append([free.name, value, meaning.unit, interval(free.low, free.high), meaning.doc])
     return rows
 
@@ -139,11 +139,11 @@ def comparison_html(comparison: Comparison) -> str:
 
 def document_html(document: Document) -> str:
     """The document in brief, with its plots."""
-    shown: list[Markup] = []
+    parts: list[Markup] = []
     for block in blocks_of(document.sections):
         if isinstance(block, Grid) and block.brief:
-            shown.append(table(block.rows))
+            parts.append(table(block.rows))
         elif isinstance(block, Plot) and block.draw is not None:
-            shown.append(picture(block.draw(), block.caption))
+            parts.append(picture(block.draw(), block.caption))
     lines = [f"{document.verdict}.", *document.sentences]
-    return page(f"{document.kind}: {document.title}", sentences(lines), *shown)
+    return page(f"{document.kind}: {document.title}", sentences(lines), *parts)

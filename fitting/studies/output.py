@@ -1,4 +1,4 @@
-"""Where a job's results and its lines of text go."""
+"""The folder of a job's results, and what the job logs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from .fit import run_folder
 
 @contextmanager
 def output_folder(output: str | Path | None) -> Iterator[Path | None]:
-    """The folder for the results, if there is to be one, claimed for as long as a job fills it.
+    """The folder for the results, if one is wanted, claimed while a job fills it.
 
     Raises:
         ValueError: it cannot be made, or another process is filling it.

@@ -1,8 +1,8 @@
 """An experiment's clips fitted each alone, all pooled, and as a population, and what they show.
 
-Each search has a file that is named after what it follows from. So an interrupted study continues:
-called again, it finds what it had, and the search that was running goes on after its last stage. A
-search of another problem, with other settings or another seed has another name.
+Each search has a file whose name is a digest of its problem, settings and seed. An interrupted
+study that is called again reads the finished searches, and continues the one that was running
+after its last stage.
 """
 
 import dataclasses
@@ -184,7 +184,7 @@ class Estimate(TypedDict):
 
 
 class ParameterEstimates(TypedDict):
-    """What was found for a parameter, in its unit, as `population.json` holds it."""
+    """The estimates of a parameter, in its unit, as `population.json` holds them."""
 
     name: str
     unit: str
@@ -306,9 +306,9 @@ class ClipErrors:
 
 
 def without_clip(problem: Problem[jaxik.FootIK], clip: int) -> Problem[jaxik.FootIK]:
-    """The problem in which a clip has no say: none of its frames was observed.
+    """The problem in which a clip does not count: none of its frames was observed.
 
-    The clip is still played, so that the programs of the whole problem serve.
+    The clip is still played, so that the whole problem's programs can be used.
     """
     observed = problem.data[clip].reference.observed
     return eqx.tree_at(lambda p: p.data[clip].reference.observed, problem, jnp.zeros_like(observed))
@@ -361,7 +361,7 @@ class Population:
     clips: tuple[str, ...]
     """A name for each."""
     subjects: tuple[str, ...]
-    """Whom each shows; the clip's own name where the experiment does not say."""
+    """The subject of each; the clip's own name where the experiment names none."""
     alone: tuple[SearchResult, ...]
     pooled: SearchResult
     others: tuple[SearchResult, ...]
@@ -506,7 +506,7 @@ def document(population: Population) -> Document:
             Section("In detail", [Points(remarks(population), brief=True)]),
             _limits(population),
         ],
-        asked=[*pages.rows(population.experiment), ["What varies", _varying(population)]],
+        setup=[*pages.rows(population.experiment), ["What varies", _varying(population)]],
         numbers={NUMBERS: population.summary},
         files={run_folder.PARAMETERS: "the population's centre"},
     )
@@ -528,18 +528,18 @@ def remarks(population: Population) -> list[str]:
 
 def _difference(population: Population, row: ParameterEstimates) -> str:
     """Whether clips or subjects differ in a parameter."""
-    spread, things = row["spread"], f"{row['level']}s"
+    spread, members = row["spread"], f"{row['level']}s"
     assert spread is not None and spread["interval"] is not None  # of a parameter that varies
     low, high = spread["interval"]
     size = f"spread {number(spread['value'])}"
     count = len(set(population.subjects if row["level"] == "subject" else population.clips))
-    few = f", from {count} {things} only" if count < FEW else ""
+    few = f", from {count} {members} only" if count < FEW else ""
     if low > 0:
-        words = f"differs between {things}: {size} ({interval(low, high)})"
+        words = f"differs between {members}: {size} ({interval(low, high)})"
     elif spread["value"] > 0:
-        words = f"may differ between {things}: {size}, at most {high:.4g}"
+        words = f"may differ between {members}: {size}, at most {high:.4g}"
     else:
-        words = f"is alike in all {things} as far as they tell: spread at most {high:.4g}"
+        words = f"is alike in all {members} as far as they tell: spread at most {high:.4g}"
     return f"`{row['name']}` {words}{few}."
 
 
@@ -552,12 +552,12 @@ def parameter_table(population: Population) -> Table:
     for row in population.parameters:
         varies = row["spread"] is not None
         lines = [
-            [clip_label(population, c), shown(alone), shown(within) if varies else ""]
+            [clip_label(population, c), cell(alone), cell(within) if varies else ""]
             for c, (alone, within) in enumerate(zip(row["alone"], row["clips"], strict=True))
         ]
-        lines += [["pooled", shown(row["pooled"]), ""], ["population", "", shown(row["centre"])]]
+        lines += [["pooled", cell(row["pooled"]), ""], ["population", "", cell(row["centre"])]]
         if row["spread"] is not None and row["range"] is not None:
-            lines.append(["spread, of u", "", shown(row["spread"])])
+            lines.append(["spread, of u", "", cell(row["spread"])])
             lines.append([f"95 % of {row['level']}s", "", interval(*row["range"])])
         heading = f"`{row['name']}`, {_unit(row)}{_level(row)}"
         table += [[heading, *lines[0]], *(["", *line] for line in lines[1:])]
@@ -585,7 +585,7 @@ def clip_label(population: Population, clip: int) -> str:
     return name if subject is None else f"{name} ({subject})"
 
 
-def shown(estimate: Estimate) -> str:
+def cell(estimate: Estimate) -> str:
     """A value with its interval in brackets."""
     ends = estimate["interval"]
     return number(estimate["value"]) + ("" if ends is None else f" ({interval(*ends)})")

@@ -183,7 +183,7 @@ class Situation:
         clip, root = place_root(self.animate(seconds), terrain)
         times = np.arange(clip.frame_count) / clip.fps
         carried = None if self.vehicle is None else self.vehicle(times)
-        return Animation(clip, terrain, root=root, carried=carried, is_made=True)
+        return Animation(clip, terrain, root=root, carried=carried, is_synthetic=True)
 
 
 class Plan(NamedTuple):
@@ -455,11 +455,11 @@ def _short(motion: PlacedMotion, name: str) -> str:
     return f"{measure.heading} {measure.format(getattr(motion.measures, name))}{MISS}"
 
 
-def _line(axes: Axes, points: np.ndarray, **look: Any) -> None:
+def _line(axes: Axes, points: np.ndarray, **style: Any) -> None:
     """A path from the side, interrupted where it jumps."""
     jumps = np.linalg.norm(np.diff(points, axis=0), axis=1) > JUMP
     broken = np.insert(points, np.flatnonzero(jumps) + 1, np.nan, axis=0)
-    axes.plot(broken[:, 2], broken[:, 1], **look)
+    axes.plot(broken[:, 2], broken[:, 1], **style)
 
 
 def _heights(scene: Scene) -> tuple[float, float]:
@@ -505,7 +505,7 @@ def document(suite: Suite) -> Document:
             Section("Beyond their bounds", [Points(missed(suite) or ["Nothing."])]),
             _limits(suite),
         ],
-        asked=_asked(suite),
+        setup=_setup(suite),
         numbers={NUMBERS: _numbers(suite)},
         view=_view(suite) if suite.scenes else None,
     )
@@ -566,7 +566,8 @@ def _view(suite: Suite) -> View:
     counts = _counts(suite)
     worst = max(counts, key=counts.__getitem__)
     clips = [
-        comparison.shown(scene.comparison, suite.systems, watched=worst) for scene in suite.scenes
+        comparison.viewed_clip(scene.comparison, suite.systems, watched=worst)
+        for scene in suite.scenes
     ]
     names = [scene.situation.name for scene in suite.scenes]
     return View(clips, names, f"{100 * VISIBLE:.2g} cm (of an adult)")
@@ -586,7 +587,7 @@ def _limits(suite: Suite) -> Section:
     return Section("Limits of the data", [Points(lines)])
 
 
-def _asked(suite: Suite) -> Table:
+def _setup(suite: Suite) -> Table:
     return [
         ["Systems", ", ".join(f"`{name}`" for name in suite.systems) or "none was run"],
         ["Situations", ", ".join(entry.name for entry in suite.plan.situations)],

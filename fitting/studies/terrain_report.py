@@ -125,7 +125,7 @@ def document(mesh: Path, terrain: Reconstruction, clip: Clip) -> Document:
                 ],
             )
         ],
-        asked=[["Clip", clip.source]],
+        setup=[["Clip", clip.source]],
         numbers={mesh.with_suffix(NUMBERS).name: numbers(terrain, clip)},
     )
 
@@ -299,8 +299,8 @@ def _draw_plan(axes: Axes, terrain: Reconstruction, margin: float, legs: tuple[s
     heights = 100 * terrain.surface.heights(points.reshape(-1, 2)).reshape(points.shape[:2])
     stances = terrain.stances
     measured = 100 * stances.heights
-    shown = np.concatenate([heights.ravel(), measured[stances.used]])
-    lowest, highest = shown.min(), max(shown.max(), shown.min() + 1.0)
+    visible = np.concatenate([heights.ravel(), measured[stances.used]])
+    lowest, highest = visible.min(), max(visible.max(), visible.min() + 1.0)
     colours = {"vmin": lowest, "vmax": highest, "cmap": "viridis"}
     image = axes.pcolormesh(x, z, heights, shading="nearest", rasterized=True, **colours)
     axes.figure.colorbar(image, ax=axes, label="height, cm", shrink=0.8)

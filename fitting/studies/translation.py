@@ -74,7 +74,7 @@ FAITHFUL = 0.95  # fraction of a correction from which on it counts as reproduce
 
 @dataclass(frozen=True)
 class NamedSystem:
-    """A system under the name by which the user asked for it."""
+    """A system under the name that the user gave."""
 
     name: str
     """Of a preset, or the stem of a parameter file."""

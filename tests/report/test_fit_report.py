@@ -375,7 +375,7 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitt
 
 def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path, undrawn):
     fit_report.fit_document(fitted).write(tmp_path, stored=True)
-    of_fit = (tmp_path / run_folder.SUMMARY).read_text().partition("\n## What was asked\n")[0]
+    of_fit = (tmp_path / run_folder.SUMMARY).read_text().partition("\n## Setup\n")[0]
     text, _ = write_posterior(tmp_path, fitted, invented_posterior())
     assert write_posterior(tmp_path, fitted, invented_posterior())[0] == text
     assert text.startswith(f"{of_fit}\n## Posterior\n")

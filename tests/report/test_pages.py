@@ -305,7 +305,7 @@ def test_the_page_says_what_was_found(page, fitted):
 
 def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, monkeypatch):
     monkeypatch.setattr(Fit, "playbacks", (playback(sigmas={"contact": 0.25}), playback()))
-    asked = dict(fit_report._asked(dataclasses.replace(fitted)))
+    asked = dict(fit_report._setup(dataclasses.replace(fitted)))
     assert asked["Noise, m and rad"] == "ankle 0.02, knee 0.03, pelvis 0.02, contact 0.25"
 
 
@@ -367,7 +367,7 @@ def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
 
 def test_a_long_clip_has_fewer_frames_and_many_grounds_are_coarser(fitted, motions, monkeypatch):
     (play,) = fitted.playbacks
-    shown = fit_report.shown(motions, "captured", worst_window.find_worst_window(play))
+    shown = fit_report.viewed_clip(motions, "captured", worst_window.find_worst_window(play))
     (whole,) = motion_data.pack([shown])
     assert motion_data.steps_between_frames([shown]) == [1]  # 30 Hz
     assert motion_data.steps_between_frames([shown], -1) == [8]  # one frame of seven is left
@@ -443,7 +443,7 @@ def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
     assert page.elements.count("script") == 2
     loads = {load for load in page.loads if not load.startswith("data:")}
     assert loads == {"compare.md", "compare.json", "compare.png"}
-    assert {"h2 Limits of the data", "h2 What was asked"} <= set(page.headings)
+    assert {"h2 Limits of the data", "h2 Setup"} <= set(page.headings)
     assert compared.accuracy["deep"].ankle == pytest.approx(DEEP)
 
 
@@ -491,7 +491,7 @@ def test_what_went_badly_comes_first_and_what_says_nothing_is_left_out(tmp_path)
             Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")]),
             Section("Nothing", [Grid([["x", "y"]], "none"), Points([]), Text("")]),
         ],
-        asked=[["What", HOSTILE]],
+        setup=[["What", HOSTILE]],
     ).write(tmp_path)
     page = Page(tmp_path / pages.PAGE)
     assert "bad ◐ bad <i> good a b good too" in page.text
@@ -501,7 +501,7 @@ def test_what_went_badly_comes_first_and_what_says_nothing_is_left_out(tmp_path)
     text = (tmp_path / "summary.md").read_text()
     findings = "- bad <i>\n- good `a` **b**\n- good too"
     assert text.startswith(f"# {HOSTILE}\n\na test: **bad**.\n\n{findings}\n\n## Table")
-    assert page.headings == [f"h1 {HOSTILE}", "h2 Table", "h2 What was asked"]
+    assert page.headings == [f"h1 {HOSTILE}", "h2 Table", "h2 Setup"]
 
 
 def test_pictures_become_small_enough(tmp_path, monkeypatch):

@@ -50,5 +50,5 @@ def test_an_interrupt_loses_the_row_that_is_being_made_and_no_other():
         begun.run()
     assert begun.finished() == ["A", "B"] and begun.missing == [2]
     stored["c"] = "written by a worker"
-    begun.look()
+    begun.read_stored()
     assert begun.finished() == ["A", "B", "written by a worker"]

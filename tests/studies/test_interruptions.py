@@ -137,7 +137,7 @@ def experiment_file(tmp_path, monkeypatch) -> Path:
     """Of a fit without a report, which alone needs the pipeline."""
     small_studies.quick_fits(monkeypatch)
     monkeypatch.setattr(Fit, "groups", [])
-    monkeypatch.setattr(fit_jobs, "Rehearsal", Mock())
+    monkeypatch.setattr(fit_jobs, "WarmUp", Mock())
     monkeypatch.setattr(fit_jobs.fit_report, "write_fit", lambda *_, **__: None)
     return write(tmp_path, clips=HALF_SECOND, rest=FEW)
 
@@ -169,10 +169,10 @@ def test_a_killed_fit_goes_on_after_its_search_and_after_the_last_stage_of_its_p
         patch.setattr(profiling, "STAGES", [*stages[:4], kill])
         fitting.fit(experiment_file, killed)
     assert "a fit that was interrupted here goes on after 14 stages of its search" in lines
-    whole, rehearsal = killed.parent / "whole", Mock()
-    monkeypatch.setattr(fit_jobs, "Rehearsal", rehearsal)
+    whole, warm_up = killed.parent / "whole", Mock()
+    monkeypatch.setattr(fit_jobs, "WarmUp", warm_up)
     fitting.fit(experiment_file, whole, report=False)
-    rehearsal.assert_not_called()  # its motions are for the report
+    warm_up.assert_not_called()  # its motions are for the report
     monkeypatch.setattr(profiling, "STAGES", [kill] * 4 + stages[4:])
     with listening(lines.append):
         fitting.fit(experiment_file, killed)

@@ -229,10 +229,10 @@ def test_a_verdict_is_true_unless_the_motion_without_errors_says_otherwise(
     assert (", which is not true" in wrong_model.fit_line(fit)) is not true
 
 
-def test_a_kept_system_that_is_worse_than_the_animation_is_outside():
+def test_a_selected_system_that_is_worse_than_the_animation_is_outside():
     worse = judgement(False, motions(animation=1.0, before=2.0, fitted=1.3))
     assessment = assess([replicate(), replicate(worse, worse), replicate()])
-    assert assessment.outside == ["the kept system against the animation"]
+    assert assessment.outside == ["the selected system against the animation"]
     assert assessment.worse == (2,) and assessment.false == ()
     assert assessment.fitted_no_worse.hits == assessment.kept_no_worse_noise_free.hits == 2
     near = judgement(False, motions(animation=1.0, before=2.0, fitted=1.14))  # 1.7 mm rms

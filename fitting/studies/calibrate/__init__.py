@@ -1,5 +1,5 @@
 """Calibration: fits of simulated motion, whose truth is known, and whether what they say is true.
 
 `calibration` simulates motion by the experiment's own system, `wrong_model` by another one;
-`replicates` makes and keeps what both fit. Start with `calibration.calibrate`.
+`replicates` makes and saves what both fit. Start with `calibration.calibrate`.
 """

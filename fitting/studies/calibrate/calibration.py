@@ -344,7 +344,7 @@ def document(experiment: Experiment, calibration: Calibration, assessment: Asses
         good=assessment.inside,
         findings=findings(assessment),
         sections=[*sections, _limits(assessment)],
-        asked=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
+        setup=[*pages.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
         numbers={NUMBERS: {"experiment": name, **assessment.summary}},
     )
 
@@ -366,7 +366,7 @@ def remarks(assessment: Assessment) -> list[str]:
 
 def listed_replicates(sentences: Mapping[str, tuple[int, ...]]) -> list[str]:
     """A sentence for each kind of replicates of which there are any, with their numbers."""
-    return [f"{words}: {_some_of(those)}." for words, those in sentences.items() if those]
+    return [f"{words}: {_some_of(numbers)}." for words, numbers in sentences.items() if numbers]
 
 
 def _some_of(replicates: tuple[int, ...]) -> str:

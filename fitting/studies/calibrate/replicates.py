@@ -407,12 +407,14 @@ def level_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
 
 
 def independent_draws(posterior: Posterior) -> Float[np.ndarray, "draws quantities"]:
-    """Kept steps an autocorrelation time or more apart, all walkers: values, log-probability."""
-    kept = np.delete(posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1)
-    both = np.concatenate([posterior.draws, kept[..., None]], axis=-1)
+    """Values and log-probability of all walkers, at steps an autocorrelation time apart or more."""
+    log_probability = np.delete(
+        posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1
+    )
+    both = np.concatenate([posterior.draws, log_probability[..., None]], axis=-1)
     slowest = float(posterior.autocorrelation_time.max()) / posterior.thin_by
-    apart = int(np.ceil(min(slowest, len(both))))  # infinite if nothing moves
-    return both[::-apart].reshape(-1, both.shape[-1])
+    step = int(np.ceil(min(slowest, len(both))))  # infinite if nothing moves
+    return both[::-step].reshape(-1, both.shape[-1])
 
 
 def rank(

@@ -1,15 +1,14 @@
 """Calibration under a wrong model: another system makes the motion, captured with errors.
 
-No value of the fitted parameters is true, then. What a fit says of its motion still must be: on
-frames that were held out, against the capture and against the motion that has no errors. Errors are
-those of captures: slow, constant, sudden, and of people, who are no system. None of them is the
-noise that a fit assumes, which is independent of frame and joint.
+Then no value of the fitted parameters is true. Still, what a fit says of its motion must be, on
+frames that were held out, against the capture and against the motion without errors. Errors are
+those of captures: slow, constant and sudden ones, and swings as no system makes them. None of them
+is the noise that a fit assumes, which is independent of frame and joint.
 
-Nobody sees differences as small as `UNSEEN`. So a verdict is true unless it is contradicted by
-more: one that says "fits" where the motion without errors is further off than what looks the same,
-or where the fit has made something worse; "worse" where the distance that it names is not larger
-than the other one there; "does not fit", which is said of the capture, where this is clearly within
-without its noise and jumps.
+Nobody sees differences as small as `UNSEEN`. A verdict is false if more contradicts it: "fits" if
+the motion without errors is further off than what looks the same, or if the fit has made something
+worse; "worse" if the distance that it names is not larger than the other one there; "does not fit",
+which is said of the capture, if the capture without noise and jumps is clearly close enough.
 """
 
 import copy
@@ -96,7 +95,7 @@ MOTIONS = {
     "animation": "the flat animation",
     "before": "the system before the fit",
     "fitted": "the fitted system",
-    "kept": "the kept system",
+    "kept": "the selected system",
 }
 COVERED = (
     "How often the fit's 95 % intervals contain the value of the system that made the motion, for "
@@ -162,10 +161,10 @@ def fit_line(fitted: WrongModelFit) -> str:
     """A finished fit in one line, for the terminal."""
     distances = distances_of(fitted["captured"])
     motions = distances.parts["held_out"]
-    kept = "" if distances.better == "fitted" else ", not kept"
+    selection = "" if distances.better == "fitted" else ", not selected"
     return (
         f"replicate {fitted['number'] + 1}: {word(fitted['captured'])}"
-        f"{'' if is_true(fitted) else ', which is not true'}{kept}; held out: ankles "
+        f"{'' if is_true(fitted) else ', which is not true'}{selection}; held out: ankles "
         f"{size('ankle', motions['fitted']['ankle'])}, without foot IK "
         f"{size('ankle', motions['animation']['ankle'])}; {fitted['seconds']:.1f} s"
     )
@@ -179,14 +178,14 @@ class WrongModelAssessment(Judgement):
     """What was found, on frames that were held out unless a field says otherwise."""
 
     kept_no_worse: Proportion
-    """How often the kept system is no further from the capture than the flat animation: by the root
-    mean square over ankles, knees and pelvis."""
+    """How often the selected system is no further from the capture than the flat animation, by the
+    root mean square over ankles, knees and pelvis."""
     kept_no_worse_anywhere: Proportion
     """How often no kind of joint is, and the orientation of the feet neither."""
     kept_no_worse_noise_free: Proportion
     """The first again, against the motion without errors."""
     fitted_no_worse: Proportion
-    """The first again, of the fitted system, kept or not."""
+    """The first again, of the fitted system, selected or not."""
     verdicts: Proportion
     """How often the verdict is true."""
     verdicts_of: Mapping[str, Proportion]
@@ -197,7 +196,7 @@ class WrongModelAssessment(Judgement):
     medians: Mapping[str, Mapping[str, float]]
     """m or rad, of the distances from the motion without errors, by motion and kind of joint."""
     worse: tuple[int, ...]
-    """Replicates whose kept system is worse than the animation, from 1."""
+    """Replicates whose selected system is worse than the animation, from 1."""
     false: tuple[int, ...]
     """Replicates whose verdict is not true."""
     unconverged: tuple[int, ...]
@@ -206,7 +205,7 @@ class WrongModelAssessment(Judgement):
     def checks(self) -> Mapping[str, Proportion]:
         """Both claims that are checked."""
         return {
-            "the kept system against the animation": self.kept_no_worse,
+            "the selected system against the animation": self.kept_no_worse,
             "the share of true verdicts": self.verdicts,
         }
 
@@ -360,8 +359,8 @@ def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
     """Judges all replicates of a calibration under a wrong model."""
     captured = [distances_of(fit["captured"]) for fit in fits]
     noise_free = [distances_of(fit["noise_free"]) for fit in fits]
-    kept: list[Motion] = [distances.better for distances in captured]
-    pairs = list(zip(captured, kept, strict=True))
+    selected: list[Motion] = [distances.better for distances in captured]
+    pairs = list(zip(captured, selected, strict=True))
     kept_no_worse = np.array([_no_worse(*pair) for pair in pairs])
     true = np.array([is_true(fit) for fit in fits])
     words = np.array([word(fit["captured"]) for fit in fits])
@@ -370,13 +369,13 @@ def assess(fits: Sequence[WrongModelFit]) -> WrongModelAssessment:
         kept_no_worse=_share(kept_no_worse, wanted=(1.0, 1.0)),
         kept_no_worse_anywhere=_share([_no_worse_anywhere(*pair) for pair in pairs]),
         kept_no_worse_noise_free=_share(
-            [_no_worse(*pair) for pair in zip(noise_free, kept, strict=True)]
+            [_no_worse(*pair) for pair in zip(noise_free, selected, strict=True)]
         ),
         fitted_no_worse=_share([_no_worse(distances, "fitted") for distances in captured]),
         verdicts=_share(true, wanted=(TRUE_VERDICTS, 1.0)),
-        verdicts_of={said: _share(true[words == said]) for said in WORDS},
+        verdicts_of={verdict: _share(true[words == verdict]) for verdict in WORDS},
         coverage_of=_coverage(fits),
-        medians=_medians(noise_free, kept),
+        medians=_medians(noise_free, selected),
         worse=numbers(~kept_no_worse),
         false=numbers(~true),
         unconverged=numbers([not fit["converged"] for fit in fits]),
@@ -449,11 +448,14 @@ def _coverage(fits: Sequence[WrongModelFit]) -> dict[str, Proportion]:
     return {name: _share(covered) for name, covered in hits.items()}
 
 
-def _medians(distances: Sequence[Distances], kept: Sequence[Motion]) -> dict[str, dict[str, float]]:
+def _medians(
+    distances: Sequence[Distances], selected: Sequence[Motion]
+) -> dict[str, dict[str, float]]:
     parts = [each.parts["held_out"] for each in distances]
     names: list[Motion] = ["animation", "before", "fitted"]
     motions = {name: [part[name] for part in parts] for name in names}
-    motions |= {"kept": [part[name] for part, name in zip(parts, kept, strict=True)]}  # type: ignore[dict-item]
+    pairs = zip(parts, selected, strict=True)
+    motions |= {"kept": [part[name] for part, name in pairs]}  # type: ignore[dict-item]
     return {
         name: {kind: float(np.median([each[kind] for each in kinds])) for kind in CLOSE}
         for name, kinds in motions.items()
@@ -470,7 +472,7 @@ class ErrorSizes:
     """m, standard deviation of each coordinate of a joint's constant offset, which turns with the
     pelvis."""
     turn: float
-    """rad, likewise of the constant rotations of pelvis and feet."""
+    """rad, standard deviation of the constant rotations of pelvis and feet, about each axis."""
     jump: float
     """m, by which a marker jumps, with one or more frames of one joint."""
     swing: float
@@ -606,19 +608,19 @@ def checks_table(assessment: WrongModelAssessment) -> Table:
     """A row for each claim, checked ones first."""
     rows = [["", "found", "share", "bounds", "wanted", "inside"]]
     wanted = f"{percent(TRUE_VERDICTS, 0)} or more"
-    rows.append(
-        share_row("the kept system no worse than the animation", assessment.kept_no_worse, "all")
-    )
+    selected = "the selected system no worse than the animation"
+    rows.append(share_row(selected, assessment.kept_no_worse, "all"))
     rows.append(share_row("true verdicts", assessment.verdicts, wanted))
     others = {
-        f'true where the verdict is "{said}"': of for said, of in assessment.verdicts_of.items()
+        f'true where the verdict is "{verdict}"': of
+        for verdict, of in assessment.verdicts_of.items()
     }
     others |= {
-        "the kept system no worse, by the motion without errors": (
+        "the selected system no worse, by the motion without errors": (
             assessment.kept_no_worse_noise_free
         ),
-        "the kept system no worse in any kind of joint": assessment.kept_no_worse_anywhere,
-        "the fitted system no worse, kept or not": assessment.fitted_no_worse,
+        "the selected system no worse in any kind of joint": assessment.kept_no_worse_anywhere,
+        "the fitted system no worse, selected or not": assessment.fitted_no_worse,
     }
     return rows + [[*share_row(words, of, "")[:-1], ""] for words, of in others.items()]
 
@@ -642,7 +644,7 @@ def coverage_table(assessment: WrongModelAssessment) -> Table:
 def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> list[str]:
     """What the tables do not say, a sentence each; nothing if there is nothing to say."""
     sentences = {
-        "The kept system is worse than the animation in replicates": assessment.worse,
+        "The selected system is worse than the animation in replicates": assessment.worse,
         "The verdict is not true in replicates": assessment.false,
         "Fits that did not converge": assessment.unconverged,
     }
@@ -653,8 +655,8 @@ def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> 
             f"{describe_distances(motions['fitted'])} in {PART_NAMES[part]}"
             for part, motions in distances_of(fitted["noise_free"]).parts.items()
         )
-        said = fitted["captured"]["sentence"]
-        lines.append(f'Replicate {number} says: "{said}" Without errors: {off}.')
+        sentence = fitted["captured"]["sentence"]
+        lines.append(f'Replicate {number} says: "{sentence}" Without errors: {off}.')
     return lines
 
 
@@ -685,7 +687,7 @@ def document(
         good=assessment.inside,
         findings=findings(assessment),
         sections=[*sections, Section("Limits of the data", [Points(LIMITS)])],
-        asked=[
+        setup=[
             *pages.rows(experiment),
             ["Made by", truth],
             ["Simulated motions", f"{assessment.replicates}"],
@@ -696,11 +698,12 @@ def document(
 
 def findings(assessment: WrongModelAssessment) -> list[Finding]:
     """What was found, and whether there are too few motions for it."""
-    kept, true = assessment.kept_no_worse, assessment.verdicts
+    selected, true = assessment.kept_no_worse, assessment.verdicts
     motions = f"{counted(assessment.replicates, 'motion')} of another system"
     shares = (
-        f"The kept system is no worse than the animation in {kept.hits} of {kept.total} cases, and "
-        f"{true.hits} of {true.total} verdicts are true."
+        "The selected system is no worse than the animation in "
+        f"{selected.hits} of {selected.total} cases, and {true.hits} of {true.total} verdicts are "
+        "true."
     )
     text = f"True under a wrong model: on {motions} everything is inside its bounds. {shares}"
     if not assessment.inside:

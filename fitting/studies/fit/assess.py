@@ -48,7 +48,7 @@ def search_with_noise(
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
-    Unless the experiment asks for noise that moves the best point, it only gets a weight.
+    Unless the experiment estimates noise that moves the best point, only the weight changes.
     """
     solution = search(problem, experiment)
     settings, noise = experiment.fit.search, experiment.noise
@@ -64,7 +64,7 @@ def search_identity(problem: Problem[jaxik.FootIK], experiment: Experiment) -> s
 def weighted(
     problem: Problem[jaxik.FootIK], experiment: Experiment, solution: Solution
 ) -> Problem[jaxik.FootIK]:
-    """The problem with the weight by which the residuals at its solution count for intervals."""
+    """The problem with the weight of residuals in intervals, as those at its solution imply."""
     if experiment.noise.correlation != "counted" or experiment.independent_every:
         return problem
     with activity.announced("Weighing the residuals"):

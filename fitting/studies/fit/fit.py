@@ -359,8 +359,8 @@ class Fit(Shown):
         return capture_check.check(self.clips)
 
     @property
-    def kept_system(self) -> jaxik.FootIK:
-        """The system that is worth keeping: the fitted one, unless the one before it is better."""
+    def selected_system(self) -> jaxik.FootIK:
+        """The fitted system, unless the one before the fit is better."""
         return self.ik if self.distances.better == "fitted" else self._before[0]
 
     @cached_property

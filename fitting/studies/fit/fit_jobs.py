@@ -21,7 +21,7 @@ from fitting.studies.output import log_output, output_folder
 from . import capture_check, fit_report, record_price, run_folder
 from .assess import assess_solution, search_identity, search_with_noise
 from .fit import Fit
-from .fit_motions import Rehearsal
+from .fit_motions import WarmUp
 
 INTERRUPTED = "interrupted; assessing and writing the best point so far"
 
@@ -61,9 +61,9 @@ def fit(
         activity.log("\n".join(lines))
         activity.report(loaded)
         checkpoints = open_checkpoints(run, experiment, problem)
-        rehearsal = Rehearsal(problem) if run is not None and report else None
+        warm_up = WarmUp(problem) if run is not None and report else None
         with checkpoints:
-            with nullcontext() if rehearsal is None else activity.watched_by(rehearsal):
+            with nullcontext() if warm_up is None else activity.watched_by(warm_up):
                 problem, solution = search_with_noise(problem, experiment)
             if solution.interrupted:
                 activity.log(INTERRUPTED)
@@ -76,7 +76,7 @@ def fit(
                 run_folder.save_fit(run, fitted)
             opening = _price_of_record(fitted)
         if run is not None and report:
-            fit_report.write_fit(run, fitted, opening, rehearsal=rehearsal)
+            fit_report.write_fit(run, fitted, opening, warm_up=warm_up)
         if not fitted.solution.interrupted:
             checkpoints.remove()
         activity.log(joined(["", fit_report.fit_text(fitted, opening)]))

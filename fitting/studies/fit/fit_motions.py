@@ -1,6 +1,6 @@
 """The motions that a fit is about, as whole skeletons on their ground, for the report's page.
 
-The run folder keeps two of them, the flat animation and the fitted motion.
+The run folder has two of them, the flat animation and the fitted motion.
 
 The system before a fit plays the clips in another thread, while the search goes on.
 
@@ -86,7 +86,7 @@ def summarised(motions: Sequence[ClipMotions]) -> dict[str, Accuracy]:
 
 
 def saved_clips(fitted: Fit) -> dict[str, Clip]:
-    """What the run folder keeps of the motions, by file name; numbered for several clips."""
+    """The motions in the run folder, by file name; numbered for several clips."""
     clips: dict[str, Clip] = {}
     for number, (data, result) in enumerate(zip(fitted.clips, fitted.results, strict=False), 1):
         ending = f"_{number}.npz" if len(fitted.clips) > 1 else ".npz"
@@ -95,11 +95,11 @@ def saved_clips(fitted: Fit) -> dict[str, Clip]:
     return clips
 
 
-class Rehearsal(activity.Watcher):
+class WarmUp(activity.Watcher):
     """Plays the clips of a problem once, from a search's first report or when results are wanted.
 
-    Not before, as until then programs of the search are compiled. Its thread has no context, so
-    that what it compiles is not shown as what the search waits for.
+    Until then the programs of the search are compiled. Its thread has no context, so that its
+    programs are not listed as those for which the search waits.
     """
 
     def __init__(self, problem: Problem[jaxik.FootIK]):

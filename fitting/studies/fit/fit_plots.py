@@ -60,8 +60,8 @@ def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """Heights of ankles and pelvis over time above the ground; whole clip and a part of it."""
     figure, columns = _whole_and_part(playback, len(legs) + 1, title)
     ground = 100 * playback.ground_height()
-    for shown in columns:
-        for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
+    for panels in columns:
+        for leg, (axes, name) in enumerate(zip(panels, legs, strict=False)):
             _plot_motions(
                 axes, playback, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg])
             )
@@ -69,9 +69,9 @@ def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
             axes.set_title(
                 f"{name.capitalize()} ankle, with the ground under it ({playback.label})"
             )
-        _plot_motions(shown[-1], playback, lambda motion: 100 * playback.height(motion.pelvis))
-        earth(shown[-1], playback.time, ground.mean(axis=1))
-        shown[-1].set_title("Pelvis, with the mean ground under the feet")
+        _plot_motions(panels[-1], playback, lambda motion: 100 * playback.height(motion.pelvis))
+        earth(panels[-1], playback.time, ground.mean(axis=1))
+        panels[-1].set_title("Pelvis, with the mean ground under the feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
     legend(figure, *_lines(playback), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
@@ -117,8 +117,8 @@ def knees(playback: Playback, legs: Sequence[str], limits: Sequence[float], titl
     """Knee angles over time with the fitted limits; whole clip and a part of it."""
     figure, columns = _whole_and_part(playback, len(legs), title)
     lines = _lines(playback)
-    for shown in columns:
-        for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
+    for panels in columns:
+        for leg, (axes, name) in enumerate(zip(panels, legs, strict=True)):
             _plot_motions(
                 axes, playback, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg])
             )
@@ -193,14 +193,14 @@ def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
         axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(playback, start, end)}")
         axes.set_xlabel("time, s")
     released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
-    shown = [
+    entries = [
         (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
         (locking, Patch(color=LOCKED, label="foot locked")),
         (locking, released),
         (labelled, Patch(color=CAPTURED, label=f"stance, {playback.label}")),
         (bool(np.any(playback.slide)), Patch(color=SLIDING, label="sliding")),
     ]
-    legend(figure, *(entry for visible, entry in shown if visible))
+    legend(figure, *(entry for visible, entry in entries if visible))
     return figure
 
 
@@ -244,12 +244,12 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
 
 def _lines(playback: Playback) -> list[Line2D]:
     """Legend entries of the three motions."""
-    shown = (
+    motions = (
         (BEFORE, "flat animation, before foot IK"),
         (AFTER, "after fitted foot IK"),
         (CAPTURED, playback.label),
     )
-    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in shown]
+    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in motions]
 
 
 def _whole_and_part(playback: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
@@ -349,13 +349,13 @@ def noise(playback: Playback, title: str) -> Figure:
 
 def _draw_autocorrelation(axes: Axes, residuals: np.ndarray, active: np.ndarray, dt: float) -> None:
     r, pairs = autocorrelations(residuals, active)
-    shown = min(len(r), max(round(SECONDS / dt), 1))
-    lags = dt * np.arange(1, shown + 1)
-    band = 1.96 / np.sqrt(np.maximum(pairs[:shown], 1))
+    count = min(len(r), max(round(SECONDS / dt), 1))
+    lags = dt * np.arange(1, count + 1)
+    band = 1.96 / np.sqrt(np.maximum(pairs[:count], 1))
     axes.fill_between(lags, -band, band, color=BEFORE, alpha=0.4, linewidth=0)
-    axes.vlines(lags, 0, r[:shown], color=AFTER, linewidth=3)
+    axes.vlines(lags, 0, r[:count], color=AFTER, linewidth=3)
     axes.set_xlim(0, lags[-1] + dt)
-    low = min(-0.2, float(np.min(r[:shown], initial=0.0)) - 0.05)
+    low = min(-0.2, float(np.min(r[:count], initial=0.0)) - 0.05)
     axes.set_ylim(low, 1.0)
 
 

@@ -33,7 +33,7 @@ from fitting.report.document import (
     View,
 )
 from fitting.report.formatting import Table, figures_table, listed, percent
-from fitting.report.motion_data import ShownClip, ShownMotion
+from fitting.report.motion_data import ViewedClip, ViewedMotion
 from fitting.runtime import activity
 from fitting.runtime.beside import calls_beside
 from fitting.runtime.precision import in_float64
@@ -42,7 +42,7 @@ from jaxik.maths import parameter_tree
 from . import fit_motions, fit_plots, fit_tables, goodness_report, identifiability_report
 from .assess import MIN_IMPROVEMENT
 from .fit import Fit
-from .fit_motions import ClipMotions, Rehearsal
+from .fit_motions import ClipMotions, WarmUp
 from .run_folder import FIT, PARAMETERS, SUMMARY
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
@@ -74,7 +74,7 @@ def write_fit(
     fitted: Fit,
     opening: Sequence[Section] = (),
     details: Sequence[Section] = (),
-    rehearsal: Rehearsal | None = None,
+    warm_up: WarmUp | None = None,
 ) -> None:
     """Writes the plots of a fit, a new summary.md and its page into the folder of its run.
 
@@ -83,11 +83,11 @@ def write_fit(
         fitted: the fit.
         opening: sections to insert before the goodness of the fit.
         details: sections to insert before the pictures.
-        rehearsal: of the fit's problem, if one has begun.
+        warm_up: of the fit's problem, if one has begun.
     """
     plots: list[Plot] = []
     with activity.announced("Playing the clips with the system before the fit"):
-        before = (rehearsal or Rehearsal(fitted.problem)).results()
+        before = (warm_up or WarmUp(fitted.problem)).results()
     with ExitStack() as drawing, calls_beside():
         with activity.announced("Drawing the curves of the parameters"):  # which takes longest
             curves = _draw_search(run, fitted)
@@ -116,7 +116,7 @@ def fit_document(
     opening: Sequence[Section] = (),
     details: Sequence[Section] = (),
 ) -> Document:
-    """What a fit says; without what is measured only as much as the terminal shows."""
+    """What a fit says; without the measurements only as much as the terminal shows."""
     summary, motions = fitted.summary, []
     if measured is not None:
         every = zip(fitted.clips, measured.before, fitted.results, strict=False)
@@ -143,7 +143,7 @@ def fit_document(
         good=summary["converged"] and fitted.verdict.fits,
         findings=[Finding(sentence) for sentence in _findings(fitted, motions)],
         sections=[*sections, *details],
-        asked=_asked(fitted),
+        setup=_setup(fitted),
         files={FIT: "all numbers", PARAMETERS: "the fitted system"},
         view=_view(fitted, motions) if motions else None,
         note=" ".join(closing),
@@ -154,7 +154,7 @@ def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     windows = map(worst_window.find_worst_window, fitted.playbacks)
     labels = [scene.reference.label for scene in fitted.problem.data]
     return View(
-        [shown(*each) for each in zip(motions, labels, windows, strict=True)],
+        [viewed_clip(*each) for each in zip(motions, labels, windows, strict=True)],
         [entry.reference.name for entry in fitted.experiment.clips],
         f"{100 * motions[0].fitted.measures.visible:.2g} cm",
         stands="captured",
@@ -162,15 +162,15 @@ def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     )
 
 
-def shown(clip: ClipMotions, label: str, window: WorstWindow) -> ShownClip:
+def viewed_clip(clip: ClipMotions, label: str, window: WorstWindow) -> ViewedClip:
     """What the page shows of one clip; `label` is what it calls the captured motion."""
     worst = window.start, window.end
-    return ShownClip(
+    return ViewedClip(
         {
-            "animated": ShownMotion("flat animation", clip.animated, motion_data.ANIMATED),
-            "before": ShownMotion("before the fit", clip.before, motion_data.BEFORE),
-            "captured": ShownMotion(label, clip.captured, motion_data.CAPTURED, visible=True),
-            "fitted": ShownMotion("fitted", clip.fitted, motion_data.FITTED, True, worst),
+            "animated": ViewedMotion("flat animation", clip.animated, motion_data.ANIMATED),
+            "before": ViewedMotion("before the fit", clip.before, motion_data.BEFORE),
+            "captured": ViewedMotion(label, clip.captured, motion_data.CAPTURED, visible=True),
+            "fitted": ViewedMotion("fitted", clip.fitted, motion_data.FITTED, True, worst),
         },
         clip.stance,
         clip.ground,
@@ -361,8 +361,8 @@ def _measures(clip: ClipMotions) -> dict[str, Measures]:
     return {name: motion.measures for name, motion in motions.items()}
 
 
-def _asked(fitted: Fit) -> Table:
-    """What the experiment asks for."""
+def _setup(fitted: Fit) -> Table:
+    """The options of the experiment."""
     experiment = fitted.experiment
     sigmas = fitted.playbacks[0].sigmas
     rows = [["System", pages.system(experiment)], ["Free parameters", f"{len(experiment.free)}"]]

@@ -1,4 +1,4 @@
-"""Goodness of fit, and what is seen of the capture, in a fit's report."""
+"""Goodness of fit, and signs of an offset capture, in a fit's report."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -62,18 +62,18 @@ def _describe_sizes(fitted: Fit) -> str:
     if (loss := fitted.assumed.loss) != "squares":
         squares = f"square of the residuals' median size, before the loss `{loss}`,"
     every = fitted.experiment.independent_every
-    taken = f" One in {every:g} s counts as independent in the fit." if every else ""
+    thinning = f" One in {every:g} s counts as independent in the fit." if every else ""
     if fitted.assumed.counted:
         return (
             f"Sigmas say what a difference weighs. Reduced chi-square is the {squares} in units of "
             "what noise of this size would have; intervals do not rest on it, but on size and "
-            f"correlation of the residuals.{taken}"
+            f"correlation of the residuals.{thinning}"
         )
     return (
         f"Reduced chi-square is the {squares} in units of what is expected: 1 if sigmas and system "
         "are right. p is the probability of one at least as far from 1; its degrees of freedom are "
         "the active residuals (observed, of present legs, with a finite sigma), less what their "
-        f"correlation and the fitted parameters take.{taken} Contact labels and accelerations "
+        f"correlation and the fitted parameters take.{thinning} Contact labels and accelerations "
         "(`smooth`) have no normal noise, so they are not tested."
     )
 
@@ -194,11 +194,11 @@ def _estimated_sigmas(fitted: Fit) -> Table:
     table = [["sigma", "unit", "given", "estimated", "95 % interval"]]
     for kind, sigma in fitted.noise.sigmas.items():
         name, unit, factor = RESIDUALS[kind]
-        given = fitted.experiment.sigmas.get(kind, DEFAULT_SIGMAS[kind])
+        assumed = fitted.experiment.sigmas.get(kind, DEFAULT_SIGMAS[kind])
         degrees = pooled([g.left for g in fitted.groups if g.kind == kind]).degrees
         spread = math.exp(NORMAL / math.sqrt(2 * max(degrees, 1)))
         ends = interval(factor * sigma / spread, factor * sigma * spread)
-        table.append([name, unit, number(factor * given), number(factor * sigma), ends])
+        table.append([name, unit, number(factor * assumed), number(factor * sigma), ends])
     return table
 
 
@@ -226,29 +226,29 @@ def sentences(fitted: Fit) -> list[str]:
 
 def _of_clip(signs: CaptureSigns) -> list[tuple[str, str]]:
     """What one clip shows: the key of [capture] that fits it, and a sentence."""
-    ground, found = signs.ground, []
+    ground, rows = signs.ground, []
     if ground.height:
         side = "over" if ground.height > 0 else "in"
         text = (
             f"standing feet are {_cm(ground.height)} {side} the ground in the median of "
             f"{ground.stances} stances, which scatter by {_cm(ground.scatter)}: a floor offset?"
         )
-        found.append(("ground_height", text))
+        rows.append(("ground_height", text))
     for axis, tilt in (("x", ground.tilt_x), ("z", ground.tilt_z)):
         if abs(tilt) >= math.radians(0.1):
             text = (
                 f"standing feet {'rise over' if tilt > 0 else 'sink into'} the ground by "
                 f"{math.degrees(abs(tilt)):.1f}° along {axis}: a tilted floor?"
             )
-            found.append((f"ground_tilt_{axis}", text))
+            rows.append((f"ground_tilt_{axis}", text))
     if signs.lag:
         order = "after" if signs.lag > 0 else "before"
         text = (
             f"the captured ankles move {1000 * abs(signs.lag):.0f} ms {order} the fitted ones: a "
             "time shift?"
         )
-        found.append(("time_shift", text))
-    return [(name, f"{text} `[capture] {name} = {{}}` fits it along.") for name, text in found]
+        rows.append(("time_shift", text))
+    return [(name, f"{text} `[capture] {name} = {{}}` fits it along.") for name, text in rows]
 
 
 def _cm(metres: float) -> str:

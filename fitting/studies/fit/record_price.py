@@ -30,7 +30,7 @@ class RecordPrice:
     cost: float
     """Of the fit of what the record holds."""
     whole_cost: float
-    """With all of them free; one search from there, so that it is no lower bound."""
+    """With all of them free; one search from there, so that it is not a lower bound."""
     errors: Mapping[str, tuple[float, float]]
     """Root mean square of both by kind of residual; m, rad, ..."""
 

@@ -6,7 +6,7 @@ parameters.toml   the fitted system, or the one before the fit where that is bet
 parameters_fitted.toml   in that case, the fitted system
 base.npz          the flat animation, and fitted.npz the fitted motion; numbered for several clips
 chain.h5          the walkers; posterior.json is their summary
-posterior.nc      the kept draws for ArviZ, if it is installed
+posterior.nc      the draws after burn-in for ArviZ, if it is installed
 search.json       how far an unfinished fit is
 lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, report.html, *.png to read
@@ -114,7 +114,7 @@ def save_fit(run: Path, fitted: Fit) -> None:
         if fitted.distances.better != "fitted":
             system = fitted.experiment, fitted.problem
             _write_system(run / FITTED_PARAMETERS, *system, fitted.ik)
-            _write_system(run / PARAMETERS, *system, fitted.kept_system)
+            _write_system(run / PARAMETERS, *system, fitted.selected_system)
         for name, clip in saved_clips(fitted).items():
             save_clip(run / name, clip)
         FIT_FILE.write(run / FIT, fitted.summary)
@@ -209,7 +209,7 @@ def write_toml(path: Path, text: str) -> None:
 
 
 def _check_toml_format(path: Path) -> None:
-    """Raises ValueError for a format that is not known; files of the first release name none."""
+    """Raises ValueError for an unknown format; files of the first release name none."""
     with open(path, encoding="utf-8", errors="replace") as file:
         version = FORMAT_LINE.fullmatch(file.readline())
     if version is not None:

@@ -2,7 +2,7 @@
 
 Work goes through one program for each shape of clip, in chunks of one size: the last one is filled
 up. A chunk is spread over the devices of this process, and chunks over the processes that
-`jax.distributed` has brought together, which at the end tell each other what they found.
+`jax.distributed` has brought together, which at the end exchange their results.
 """
 
 import dataclasses
@@ -43,8 +43,8 @@ MEMORY = 1e9  # bytes that chunks take at once, together
 WORKSPACE = 1.5
 CACHED = 64  # systems, or clips, at a time on a core of a CPU
 Measure: TypeAlias = Callable[[Scene, jaxik.Result], Mapping[str, Float[Array, "*numbers"]]]
-"""What is kept of a system on a clip. It must be a function of a module: a new lambda for each call
-would compile anew. What was not observed should not count, for clips are made longer."""
+"""What is measured of a system on a clip. It must be a function of a module, as a new lambda for
+each call would compile anew. Frames that were not observed should not count: clips get more."""
 Stacked: TypeAlias = tuple[bool, ...] | None
 KINDS = ("ankle", "knee", "pelvis", "foot", "body")
 
@@ -94,7 +94,7 @@ def evaluate_many(
     memory: float = MEMORY,
     devices: Sequence[Any] | None = None,
 ) -> dict[str, Float[np.ndarray, "systems clips *numbers"]]:
-    """What every system of a batch makes of every clip, in numbers.
+    """Measures every system of a batch on every clip.
 
     Memory holds one chunk at a time, or on a CPU one for each core, beside clips and results. A
     chunk has as many systems, or clips, as `memory` allows by what one takes, the bytes of all that
@@ -106,7 +106,7 @@ def evaluate_many(
             share the array. `vary`, and `jax.vmap` of anything that makes a system, make one.
         clips: an experiment, the path of its file, or the data of a problem. Of any length; each
             shape of ground has a program of its own, and lengths share a few.
-        measure: what is kept; a mapping of arrays. By default errors and cost.
+        measure: what is measured, as a mapping of arrays; by default errors and cost.
         chunk: how many systems, or clips where there are more of these, to compute at once.
         memory: bytes, of all chunks that are computed at once.
         devices: of this process; None takes all of them.
@@ -239,12 +239,12 @@ def _along(
         for tree, flags in arguments
     )
 
-    def of_one(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
+    def measured(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
         return dict(measure(scene, run_scene(ik, scene)))
 
     # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
     return jax.shard_map(
-        lanes(of_one, in_axes=in_axes),
+        lanes(measured, in_axes=in_axes),
         mesh=mesh,
         in_specs=specs,
         out_specs=split,
@@ -275,7 +275,7 @@ def _batch_size(ik_batch: jaxik.FootIK) -> int:
 
 
 def _from_all_processes(results: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What all processes found together: each has zeros where others computed."""
+    """The results of all processes: each has zeros where others computed."""
     if jax.process_count() == 1:
         return results
     from jax.experimental import multihost_utils

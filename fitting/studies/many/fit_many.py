@@ -3,9 +3,9 @@
 runs/EXPERIMENT/CLIP/seed_0   where a clip is fitted alone
 runs/EXPERIMENT/seed_0        where the clips of an experiment are fitted together
 
-The row of a fit, in its run folder, is the last file that is written there: a folder that has it is
-whole. The table has a row for each, as CSV and, with pyarrow, as Parquet. Parameters of different
-experiments share it: what a fit has not is empty.
+The row of a fit is the last file that is written into its run folder: a folder that has it is
+whole. The table has a row for each fit, as CSV and, with pyarrow, as Parquet. It has the parameters
+of all experiments; those that a fit lacks are empty.
 """
 
 import csv
@@ -90,7 +90,7 @@ SPREAD = (
 )
 
 COLUMNS = 4
-SHOWN = 15  # parameters
+DRAWN = 15  # parameters
 SHORTEST = 1e-3  # s, of a fit as the histogram shows it
 SINGLE = 150  # fits, up to which each has its interval
 
@@ -189,7 +189,7 @@ def _file_name(text: str) -> str:
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number where several are alike."""
+    """The names, numbered where several are equal."""
     counts = Counter(name.casefold() for name in names)
     return [
         f"{name}_{number}" if counts[name.casefold()] > 1 else name
@@ -238,7 +238,7 @@ ROW_FILE = JsonFile(
 
 
 def make_row(task: FitTask, error: str = "") -> Row:
-    """The row of a fit that could not be made, or of one that is whole but for what it found."""
+    """The row of a fit that failed, or of a finished one, still without its results."""
     return {
         "experiment": task.name,
         "clip": task.clip,
@@ -334,7 +334,7 @@ def columns(rows: Sequence[Row]) -> list[str]:
 
 
 def cells(row: Row) -> Cells:
-    """A row of the table; what it has not is left out.
+    """A row of the table, without what is unknown.
 
     Of each parameter: its value under its name, both ends of its 95 % interval, and whether the
     clip determines it.
@@ -392,7 +392,7 @@ def fit_many(
     A call with the same folder makes the fits that are missing or have failed, and no others. A
     fit that fails says why in the table and stops nothing. When a worker dies, others make its
     fits; when this process dies, only fits that were being made are lost, and of these, finished
-    stages of their search are kept.
+    stages of their search stay.
 
     Args:
         experiments: experiments, or paths of their files.
@@ -408,7 +408,7 @@ def fit_many(
 
     Raises:
         ValueError: an experiment cannot be read; there is none, or not one seed; the folder cannot
-            be made, holds something that is no such fit, or the fit of another experiment; there is
+            be made, holds something else, or the fit of another experiment; there is
             no such cluster.
     """
     loaded = _loaded(experiments)
@@ -439,7 +439,7 @@ def fit_many(
                 campaign.run(client)
         except KeyboardInterrupt:
             interrupted = True
-            campaign.look()  # a row may have been written, and not come back
+            campaign.read_stored()  # a row may have been written, and not come back
             activity.log("interrupted; writing the table of the finished fits")
         rows, made = tuple(campaign.finished()), missing - len(campaign.missing)
         fits = ManyFits(rows, count, folder, time.monotonic() - began, made, interrupted)
@@ -513,8 +513,8 @@ class FailedError(RuntimeError):
 def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
     """Makes one fit as `fit` does, and says at last that its run folder is whole.
 
-    The first fit with certain programs keeps others of this machine that need the same ones waiting
-    until it has compiled them. The folder of all fits exists, also where another machine made it.
+    Of the fits on this machine that need the same programs, the first compiles them while the
+    others wait. The folder of all fits exists, also where another machine made it.
 
     Raises:
         FailedError: the fit could not be made.
@@ -537,7 +537,7 @@ def fit_task(folder: Path, task: FitTask, *, report: bool = True) -> Row:
         row["fit"] = _in_brief(fitted.summary)
         return row
     except Exception as error:
-        if not isinstance(error, ValueError | OSError):  # which are told in a sentence
+        if not isinstance(error, ValueError | OSError):  # whose message says enough
             run.mkdir(parents=True, exist_ok=True)
             files.write_text(run / ERROR, "".join(traceback.format_exception(error)))
         raise FailedError(in_one_line(error)) from None
@@ -552,7 +552,7 @@ class _Wait(activity.Watcher):
     def reported(self, result: object) -> None:
         if isinstance(result, LoadedExperiment):
             problem = result.problem
-            # A rule of the user's own is never kept, so that nobody need wait.
+            # Programs with a rule of the user's own are never cached: nobody need wait.
             with suppress(NotPlainError):
                 key = program_key(problem.residual_function, ((problem,), {}))
                 with self._watch.waiting():
@@ -673,7 +673,7 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
             Section("Fits", [Grid(fit_table(fits), "All fits", brief=False)]),
             Section("Limits of the data", [Points(LIMITS)]),
         ],
-        asked=[
+        setup=[
             [
                 experiment.name,
                 f"{pages.system(experiment)}; {counted(len(experiment.clips), 'clip')}",
@@ -687,7 +687,7 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
 @styled
 def overview(fits: ManyFits, title: str) -> Figure:
     """Of each parameter the values of all fits; and the seconds that they took."""
-    series = list(_by_parameter(fits).items())[:SHOWN]
+    series = list(_by_parameter(fits).items())[:DRAWN]
     figure, grid = panels(len(series) + 1, COLUMNS, title, 3.6, 1.0)
     for axes, ((experiment, name), values) in zip(grid, series, strict=False):
         _values(axes, values)

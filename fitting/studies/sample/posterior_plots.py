@@ -138,10 +138,10 @@ def chain(
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     every = max(1, len(posterior.u) // POINTS)
     steps = posterior.thin_by * (1 + np.arange(len(posterior.u)))
-    shown = np.unique(np.linspace(0, posterior.u.shape[1] - 1, WALKERS).astype(int))
+    drawn = np.unique(np.linspace(0, posterior.u.shape[1] - 1, WALKERS).astype(int))
     for axes, (label, series, true) in zip(grid.T.flat, panels, strict=False):
         colour = {"color": AFTER, "linewidth": 0.5, "alpha": 0.35}
-        axes.plot(steps[::every], series[::every][:, shown], **colour)
+        axes.plot(steps[::every], series[::every][:, drawn], **colour)
         for stuck in posterior.stuck:
             axes.plot(steps[::every], series[::every, stuck], color="black", linewidth=1.2)
         axes.axvspan(0, posterior.burn_in * posterior.thin_by, color="#dddddd")
@@ -158,7 +158,7 @@ def chain(
         grid.T.flat[lowest].set_xlabel("step of the sampler")
     entries = [
         Line2D(
-            [], [], color=AFTER, label=f"walkers ({len(shown)} of {posterior.u.shape[1]} shown)"
+            [], [], color=AFTER, label=f"walkers ({len(drawn)} of {posterior.u.shape[1]} shown)"
         ),
         Line2D([], [], color="#dddddd", linewidth=8, label="burn-in, discarded"),
     ]

@@ -44,7 +44,7 @@ from .sample import SampledFit
 TEXT = "posterior.md"
 MAX_CLIPS = 4  # that are drawn
 
-SHOWN = 5  # blocks in the table
+WORST = 5  # blocks in the table
 SENSITIVE = (
     "Sensitive to their prior, for an end of the interval moves by more than a quarter of its width"
 )
@@ -83,7 +83,7 @@ def _alone(sampled: SampledFit) -> Document:
         good=converged,
         findings=[Finding(sampled.posterior.message)],
         sections=[],
-        asked=pages.rows(sampled.experiment),
+        setup=pages.rows(sampled.experiment),
     )
 
 
@@ -196,16 +196,16 @@ def covers(row: ParameterSummary, true: float) -> bool:
 
 
 @styled
-def bands(shown: Sequence[Band], title: str) -> Figure:
+def bands(channels: Sequence[Band], title: str) -> Figure:
     """One channel for each kind of residual, a column for each clip."""
-    clips = sorted({band.clip for band in shown})[:MAX_CLIPS]
-    kinds = list(dict.fromkeys(band.kind for band in shown))
+    clips = sorted({band.clip for band in channels})[:MAX_CLIPS]
+    kinds = list(dict.fromkeys(band.kind for band in channels))
     figure = Figure(
         figsize=(max(17, 8.5 * len(clips)), 2.6 * len(kinds) + 1.8), layout="constrained"
     )
     figure.suptitle(title)
     grid = figure.subplots(max(len(kinds), 1), max(len(clips), 1), squeeze=False, sharex="col")
-    for band in shown:
+    for band in channels:
         if band.clip in clips:
             axes = grid[kinds.index(band.kind), clips.index(band.clip)]
             _draw(axes, band, clip=len(clips) > 1)
@@ -248,17 +248,13 @@ def _contradictions(sampled: SampledFit, run: Path | None) -> Iterator[str]:
     yield from map(_describe, sampled.disagreements)
 
 
-def _describe(found: Disagreement) -> str:
-    sampled, fitted = interval(*found["interval"]), interval(*found["interval_of_fit"])
-    if found["reason"] == "leaves out the fit":
-        return (
-            f"The chain contradicts its fit: the 95 % interval of {found['name']}, {sampled}, "
-            f"leaves out the fitted value {number(found['value'])}."
-        )
-    return (
-        f"The chain contradicts its fit: the 95 % interval of {found['name']}, {sampled}, is "
-        f"clearly {found['reason']} than the fit's, {fitted}."
-    )
+def _describe(disagreement: Disagreement) -> str:
+    name, reason = disagreement["name"], disagreement["reason"]
+    sampled, fitted = (interval(*disagreement[key]) for key in ("interval", "interval_of_fit"))
+    text = f"The chain contradicts its fit: the 95 % interval of {name}, {sampled}, "
+    if reason == "leaves out the fit":
+        return f"{text}leaves out the fitted value {number(disagreement['value'])}."
+    return f"{text}is clearly {reason} than the fit's, {fitted}."
 
 
 def mode_sentences(posterior: Posterior) -> list[str]:
@@ -331,33 +327,33 @@ def _weight(mode: Mode) -> str:
     return f"{percent(mode.weight)} ± {percent(mode.error)}"
 
 
-def left_out_sentence(found: LeaveOneOut) -> str:
+def left_out_sentence(left_out: LeaveOneOut) -> str:
     """The figure, and how far it can be trusted."""
-    count = len(found.pareto_k)
+    count = len(left_out.pareto_k)
     text = (
         f"Log predictive density of {count} blocks of {SECONDS:g} s, each left out in turn: "
-        f"{found.elpd:.1f} ± {found.error:.1f}; effective number of parameters "
-        f"{found.parameters:.1f}."
+        f"{left_out.elpd:.1f} ± {left_out.error:.1f}; effective number of parameters "
+        f"{left_out.parameters:.1f}."
     )
-    if found.unreliable:
+    if left_out.unreliable:
         text += (
-            f" Unreliable for {found.unreliable} of them, whose Pareto k is above {found.max_k:.2g}"
-            ": the fit hangs on them."
+            f" Unreliable for {left_out.unreliable} of them, whose Pareto k is above "
+            f"{left_out.max_k:.2g}: the fit hangs on them."
         )
-    if found.neighbours > CORRELATED:
+    if left_out.neighbours > CORRELATED:
         text += (
-            f" Neighbouring blocks correlate by {found.neighbours:.2f}, so that the standard error "
-            "is too small."
+            f" Neighbouring blocks correlate by {left_out.neighbours:.2f}, so that the standard "
+            "error is too small."
         )
     return text
 
 
-def left_out_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> list[Block]:
+def left_out_blocks(left_out: LeaveOneOut, blocks: BlockLogLikelihood) -> list[Block]:
     """How well each block is predicted from the others."""
-    correlation = "unknown" if math.isnan(found.neighbours) else f"{found.neighbours:.2f}"
+    correlation = "unknown" if math.isnan(left_out.neighbours) else f"{left_out.neighbours:.2f}"
     return [
         Heading("Blocks of frames left out"),
-        Text(left_out_sentence(found), brief=True),
+        Text(left_out_sentence(left_out), brief=True),
         Text(
             "By Pareto-smoothed importance sampling, without another fit. Blocks last "
             f"{SECONDS:g} s, two steps of a walk, because what one frame misses its neighbours "
@@ -365,19 +361,19 @@ def left_out_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> list[Bloc
             "`jaxik compare --runs`, fits of several systems to the same clips are compared by "
             "this figure. The blocks that are predicted worst:"
         ),
-        Grid(worst_blocks(found, blocks), "Blocks that are predicted worst", brief=False),
+        Grid(worst_blocks(left_out, blocks), "Blocks that are predicted worst", brief=False),
     ]
 
 
-def worst_blocks(found: LeaveOneOut, blocks: BlockLogLikelihood) -> Table:
+def worst_blocks(left_out: LeaveOneOut, blocks: BlockLogLikelihood) -> Table:
     """The blocks with the lowest predictive density for each second."""
     table = [["clip", "from", "to", "log predictive density per s", "Pareto k"]]
     seconds = np.maximum(blocks.end - blocks.start, 1e-9)
-    for i in np.argsort(found.elpd_of_block / seconds)[:SHOWN]:
-        mark = "" if found.pareto_k[i] <= found.max_k else "!"
+    for i in np.argsort(left_out.elpd_of_block / seconds)[:WORST]:
+        mark = "" if left_out.pareto_k[i] <= left_out.max_k else "!"
         cells = [str(blocks.clip[i]), f"{blocks.start[i]:.1f} s", f"{blocks.end[i]:.1f} s"]
-        cells += [f"{found.elpd_of_block[i] / seconds[i]:.1f}", f"{found.pareto_k[i]:.2f}{mark}"]
-        table.append(cells)
+        density = left_out.elpd_of_block[i] / seconds[i]
+        table.append([*cells, f"{density:.1f}", f"{left_out.pareto_k[i]:.2f}{mark}"])
     return table
 
 

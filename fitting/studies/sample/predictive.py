@@ -116,7 +116,7 @@ class Band:
     captured: Float[np.ndarray, " frames"]
     """m or rad; NaN where it was not observed."""
     low: Float[np.ndarray, " frames"]
-    """2.5 %, likewise."""
+    """2.5 % of the replicates, m or rad."""
     high: Float[np.ndarray, " frames"]
     """97.5 %."""
 
@@ -185,12 +185,12 @@ def disagreements(
     """
     if not posterior.converged:
         return []
-    found = []
+    rows = []
     for fitted, sampled in zip(parameters, posterior.summary, strict=True):
         low, high = sampled["low95"], sampled["high95"]
         reason = _reason(fitted, low, high)
         if reason is not None:
-            found.append(
+            rows.append(
                 Disagreement(
                     name=fitted["name"],
                     reason=reason,
@@ -199,7 +199,7 @@ def disagreements(
                     interval=[low, high],
                 )
             )
-    return found
+    return rows
 
 
 def _reason(fitted: FittedParameter, low: float, high: float) -> Reason | None:

@@ -96,9 +96,9 @@ class _Clip:
         self._last: Playback | None = None
 
     def add(self, played: Playback, sigmas: Mapping[str, float], replicated: bool) -> None:
-        """Takes in what the system of one draw makes of the clip, and replicates its motion."""
-        given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
-        ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
+        """Adds the motion of one draw, and replicates of it if `replicated`."""
+        assumed = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
+        ratios = {kind: sigma / assumed[kind] for kind, sigma in sigmas.items()}
         frames = of_frames(played, self._scene, self._density, ratios)
         self._frames.append(self._weight * frames)
         self._last = played
@@ -112,7 +112,7 @@ class _Clip:
             both = (plain / ratios.get(kind, 1.0), noise)
             rows = [predictive.statistics_of(residuals, active) for residuals in both]
             self._statistics[kind].append(np.array(rows))
-            column, sigma = self.column(kind), given[kind]
+            column, sigma = self.column(kind), assumed[kind]
             in_units = (sigma * plain, ratios.get(kind, 1.0) * sigma * noise)
             self._channels[kind].append(np.stack([series[:, column] for series in in_units]))
 

@@ -73,10 +73,10 @@ def compare_posteriors(folders: Sequence[Path]) -> list[ComparedRun]:
                 "residuals; wanted the same clips, frames and kinds, so that predictions of the "
                 "same motion are compared"
             )
-    found = {name: _leave_one_out(name, each) for name, each in read.items()}
-    best = max(found, key=lambda name: found[name].elpd)
-    order = sorted(found, key=lambda name: -found[name].elpd)
-    return [_compare(name, found[name], found[best], read[name]) for name in order]
+    left_out = {name: _leave_one_out(name, each) for name, each in read.items()}
+    best = max(left_out, key=lambda name: left_out[name].elpd)
+    order = sorted(left_out, key=lambda name: -left_out[name].elpd)
+    return [_compare(name, left_out[name], left_out[best], read[name]) for name in order]
 
 
 def _read(folder: Path) -> BlockLogLikelihood:
@@ -91,29 +91,29 @@ def _read(folder: Path) -> BlockLogLikelihood:
 
 
 def _leave_one_out(name: str, read: BlockLogLikelihood) -> LeaveOneOut:
-    found = blocks.leave_one_out(read)
-    if found is None:
+    left_out = blocks.leave_one_out(read)
+    if left_out is None:
         raise ValueError(
             f"{name}: {len(read.values)} draws of {len(read.clip)} blocks of {blocks.SECONDS:g} s; "
             f"wanted {blocks.MIN_DRAWS} draws and two blocks or more; sample longer"
         )
-    return found
+    return left_out
 
 
 def _compare(
-    name: str, found: LeaveOneOut, best: LeaveOneOut, read: BlockLogLikelihood
+    name: str, left_out: LeaveOneOut, best: LeaveOneOut, read: BlockLogLikelihood
 ) -> ComparedRun:
-    below = best.elpd_of_block - found.elpd_of_block
+    below = best.elpd_of_block - left_out.elpd_of_block
     return ComparedRun(
         name=name,
-        elpd=found.elpd,
-        error=found.error,
+        elpd=left_out.elpd,
+        error=left_out.error,
         behind=float(below.sum()),
         behind_error=float(math.sqrt(below.size) * below.std(ddof=1)),
-        parameters=found.parameters,
-        unreliable=found.unreliable,
+        parameters=left_out.parameters,
+        unreliable=left_out.unreliable,
         clips={
-            int(clip): float(found.elpd_of_block[read.clip == clip].sum())
+            int(clip): float(left_out.elpd_of_block[read.clip == clip].sum())
             for clip in np.unique(read.clip)
         },
     )
@@ -122,13 +122,13 @@ def _compare(
 def table(runs: Sequence[ComparedRun]) -> Table:
     """A row for each run, the best first; a column for each clip if there are several."""
     clips = list(runs[0].clips)
-    shown = clips if len(clips) > 1 else []
+    listed_clips = clips if len(clips) > 1 else []
     heading = ["run", "elpd", "±", "below the best", "±", "parameters", "unreliable blocks"]
-    rows = [heading + [f"elpd of clip {clip}" for clip in shown]]
+    rows = [heading + [f"elpd of clip {clip}" for clip in listed_clips]]
     for run in runs:
         cells = [run.name, f"{run.elpd:.1f}", f"{run.error:.1f}", f"{run.behind:.1f}"]
         cells += [f"{run.behind_error:.1f}", f"{run.parameters:.1f}", str(run.unreliable)]
-        rows.append([*cells, *(f"{run.clips[clip]:.1f}" for clip in shown)])
+        rows.append([*cells, *(f"{run.clips[clip]:.1f}" for clip in listed_clips)])
     return rows
 
 
@@ -148,13 +148,13 @@ def document(runs: Sequence[ComparedRun]) -> Document:
             ),
             Section("Limits of the data", [Points(LIMITS)]),
         ],
-        asked=[["Runs", ", ".join(f"`{run.name}`" for run in runs)]],
+        setup=[["Runs", ", ".join(f"`{run.name}`" for run in runs)]],
         files={NUMBERS: "all numbers"},
     )
 
 
 def undecided(runs: Sequence[ComparedRun]) -> list[ComparedRun]:
-    """Runs whose predictions cannot be told from those of the best one."""
+    """Runs whose predictions do not differ clearly from those of the best one."""
     return [run for run in runs[1:] if run.behind < CLEAR * run.behind_error]
 
 

@@ -28,7 +28,7 @@ from fitting.studies.fit.fit import FittedParameter, PriorSummary, summarise_pri
 from .predictive import Disagreement, disagreements
 from .replay import Replay
 
-APART = 3.0  # widths of the walkers' ball between places where some of them start
+SEPARATION = 3.0  # widths of the walkers' ball between places where some of them start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +82,9 @@ def sample_around(
     Args:
         parameters: the fit, around which the walkers start.
         problem: the problem of the experiment. Sigmas that it has estimated are left open with
-            squares as loss; a robust loss, and correlations, keep the estimated ones.
+            squares as loss; with a robust loss, or with correlations, the estimated ones stay.
         experiment: its settings of the sampler.
-        chain: file that keeps the chain; one that is there is continued. None keeps it in memory.
+        chain: file of the chain; an existing one is continued. None leaves it in memory.
 
     Raises:
         ValueError: the fit has other parameters than the problem, or the file holds another chain.
@@ -117,7 +117,7 @@ def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerS
     for minimum in sorted(minima, key=lambda minimum: minimum["rise"]):
         if "values" in minimum:
             place = np.asarray(space.pack(dict(zip(space.names, minimum["values"], strict=True))))
-            if all(np.max(np.abs(place - other) / sd) > APART for other in known):
+            if all(np.max(np.abs(place - other) / sd) > SEPARATION for other in known):
                 known.append(place)
     return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))
 
@@ -131,13 +131,13 @@ def minus_cost_at(
     return float(minus_cost(problem, u, np.asarray(log_probability)))
 
 
-def shown_noise(
+def with_predictive_noise(
     problem: Problem[jaxik.FootIK], experiment: Experiment, u: Float[np.ndarray, " free"]
 ) -> Problem[jaxik.FootIK]:
     """The problem with the noise by which its motion is predicted.
 
-    Where residuals are counted, sigmas are no more than what a difference weighs, and the noise is
-    what the residuals at the fit show.
+    Where residuals are counted, sigmas only say what a difference weighs; the noise is then that of
+    the residuals at the fit.
     """
     noise = experiment.noise
     if noise.correlation != "counted" or noise.moves_optimum or experiment.independent_every:

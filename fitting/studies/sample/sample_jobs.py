@@ -28,7 +28,7 @@ from fitting.studies.output import log_output, output_folder
 from .posterior_report import posterior_text, write_posterior
 from .predictive import Band, PredictiveCheck, Statistic
 from .replay import Replay, replay
-from .sample import SampledFit, minus_cost_at, sample_around, shown_noise
+from .sample import SampledFit, minus_cost_at, sample_around, with_predictive_noise
 
 STATISTICS = ("rms", "autocorrelation", "largest")
 
@@ -74,7 +74,9 @@ def sample(
         try:
             if not posterior.interrupted:
                 u = np.array([row["u"] for row in parameters])
-                played = replay(shown_noise(problem, experiment, u), posterior, experiment.seed)
+                played = replay(
+                    with_predictive_noise(problem, experiment, u), posterior, experiment.seed
+                )
                 posterior = replace(posterior, blocks=played.blocks)
         except KeyboardInterrupt:
             posterior = replace(posterior, interrupted=True)
