@@ -9,6 +9,8 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from fitting.runtime import beside, files
@@ -118,9 +120,33 @@ def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
     axes.set_ylim(low, high)
 
 
+def shade(axes: Axes, time: np.ndarray, mask: np.ndarray, color: str, alpha: float = 1.0) -> None:
+    """Colours the whole height of the axes over the frames of a mask; the time of each is in s."""
+    half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0))
+    for start, end in edges.reshape(-1, 2):
+        ends = float(time[start]) - half, float(time[end - 1]) + half
+        axes.axvspan(*ends, color=color, alpha=alpha, linewidth=0, zorder=0)
+
+
 def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:
     """Adds a legend below the figure."""
     figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
+
+
+def line_key(label: str, color: str = "black", **properties: Any) -> Line2D:
+    """An entry of a legend for a line or, without a `linestyle`, for a `marker`."""
+    return Line2D([], [], color=color, label=label, **properties)
+
+
+def area_key(label: str, color: str, **properties: Any) -> Patch:
+    """An entry of a legend for an area."""
+    return Patch(label=label, **{"facecolor": color, "edgecolor": color, **properties})
+
+
+def ground_key(label: str = "ground") -> Patch:
+    """An entry of a legend for what `earth` draws."""
+    return area_key(label, EARTH, edgecolor=GROUND)
 
 
 def prepare_saving() -> None:

@@ -20,8 +20,6 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 import jaxik
 from fitting.clips import Clip, edit
@@ -49,7 +47,7 @@ from fitting.report.document import (
     Text,
 )
 from fitting.report.formatting import Table, listed, meanings, number, transposed
-from fitting.report.style import AFTER, CAPTURED, STAGES, legend, panels, styled
+from fitting.report.style import AFTER, CAPTURED, STAGES, area_key, legend, line_key, panels, styled
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
@@ -605,10 +603,10 @@ def overview(rows: Sequence[Row], title: str) -> Figure:
         _bars(axes, key, rows, variants)
     legend(
         figure,
-        Patch(color=AFTER, label=f"{COMPLETE}: mean of the parts held out"),
-        Patch(color=ABLATED, label="without this rule: mean of the parts held out"),
-        Line2D([], [], marker="o", linestyle="", color="black", label="each part held out"),
-        Line2D([], [], marker="D", linestyle="", color=CAPTURED, label="fitted on everything"),
+        area_key(f"{COMPLETE}: mean of the parts held out", AFTER),
+        area_key("without this rule: mean of the parts held out", ABLATED),
+        line_key("each part held out", marker="o", linestyle=""),
+        line_key("fitted on everything", CAPTURED, marker="D", linestyle=""),
     )
     return figure
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 import jaxik
 from fitting.clips import flight
@@ -31,7 +29,7 @@ from fitting.motion.measures import (
     with_soles_of,
 )
 from fitting.motion.worst_window import SECONDS, window_sums
-from fitting.report import motion_data
+from fitting.report import motion_data, style
 from fitting.report.document import (
     Block,
     Document,
@@ -47,17 +45,7 @@ from fitting.report.document import (
 )
 from fitting.report.formatting import Table, figures_table, listed, meanings, percent, transposed
 from fitting.report.motion_data import MAX_RATE, Appearance, ViewedClip, ViewedMotion
-from fitting.report.style import (
-    BEFORE,
-    CAPTURED,
-    EARTH,
-    GROUND,
-    STAGES,
-    earth,
-    legend,
-    styled,
-    whole_and_part,
-)
+from fitting.report.style import BEFORE, CAPTURED, STAGES
 from fitting.runtime import activity
 from fitting.runtime.display import Shown, data_frame
 from fitting.runtime.precision import in_float64, with_floats
@@ -346,7 +334,7 @@ class LineStyle(TypedDict):
     linewidth: float
 
 
-@styled
+@style.styled
 def overview(comparison: Comparison) -> Figure:
     """Heights of ankles and pelvis under every system, with the ground, and bars of measures."""
     styles = _line_styles(comparison.motions)
@@ -361,8 +349,8 @@ def overview(comparison: Comparison) -> Figure:
     measured = {name: motion.measures for name, motion in comparison.motions.items()}
     for axes, key in zip(grid.flat, MEASURES, strict=False):
         _bars(axes, key, measured, styles)
-    lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
-    legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
+    lines = [style.line_key(name, **line) for name, line in styles.items()]
+    style.legend(figure, *lines, style.ground_key(), columns=6)
     return figure
 
 
@@ -375,16 +363,16 @@ def _draw_heights(
     clips = {name: motion.clip for name, motion in comparison.motions.items()}
     pelvises = {name: own.positions_ws[:, own.rig.pelvis, 1] for name, own in clips.items()}
     pelvis = np.mean(list(pelvises.values()), axis=0)
-    columns = whole_and_part(figure, time, pelvis, len(clip.rig.names) + 1)
+    columns = style.whole_and_part(figure, time, pelvis, len(clip.rig.names) + 1)
     for panels in columns:
         for leg, (axes, name) in enumerate(zip(panels, clip.rig.names, strict=False)):
             for system, own in clips.items():
                 axes.plot(time, 100 * own.joints_ws(2)[:, leg, 1], **styles[system])
-            earth(axes, time, 100 * ground[:, leg])
+            style.earth(axes, time, 100 * ground[:, leg])
             axes.set_title(f"{_title(name)} ankle, with the ground under the animated one")
         for system, heights in pelvises.items():
             panels[-1].plot(time, 100 * heights, **styles[system])
-        earth(panels[-1], time, 100 * ground.mean(axis=1))
+        style.earth(panels[-1], time, 100 * ground.mean(axis=1))
         panels[-1].set_title("Pelvis, with the mean ground under the animated feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")

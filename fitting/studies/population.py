@@ -18,8 +18,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 import jaxik
 from fitting.experiment import file_tables, parameter_files
@@ -42,10 +40,10 @@ from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.motion.accuracy import position_error
 from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
-from fitting.report import pages
+from fitting.report import pages, style
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, counted, interval, listed, number
-from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES, legend, panels, styled
+from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
@@ -599,7 +597,7 @@ def _level(row: ParameterEstimates) -> str:
     return row["level"] if row["level"] == "shared" else f"per {row['level']}"
 
 
-@styled
+@style.styled
 def overview(population: Population, title: str) -> Figure:
     """A panel for each parameter that varies, and one with the errors of all clips."""
     varying = [row for row in population.parameters if row["spread"] is not None]
@@ -607,22 +605,22 @@ def overview(population: Population, title: str) -> Figure:
     columns = min(PANELS_PER_ROW, len(varying) + 1)
     height, width = 0.45 * len(labels) + 1.6, 5.6 * columns
     count = len(varying) + 1
-    figure, grid = panels(count, columns, title, height, 1.6, width=width, sharey=True)
+    figure, grid = style.panels(count, columns, title, height, 1.6, width=width, sharey=True)
     for axes, row in zip(grid, varying, strict=False):
         _estimates(axes, row)
     _errors(grid[-1], population)
     for axes in grid[::columns]:
         axes.set_yticks(range(len(labels)), labels)
     grid[0].set_ylim(len(labels) - 0.4, -0.6)
-    legend(
+    style.legend(
         figure,
-        Line2D([], [], marker="o", color=BEFORE, label="fitted alone, 95 %"),
-        Line2D([], [], marker="o", color=AFTER, label="in the population, 95 %"),
-        Line2D([], [], color=PRIOR, label="centre of the population"),
-        Patch(color=PRIOR, alpha=0.15, label="95 % of clips or subjects"),
-        Line2D([], [], color=CAPTURED, linestyle="--", label="pooled"),
+        style.line_key("fitted alone, 95 %", BEFORE, marker="o"),
+        style.line_key("in the population, 95 %", AFTER, marker="o"),
+        style.line_key("centre of the population", PRIOR),
+        style.area_key("95 % of clips or subjects", PRIOR, alpha=0.15),
+        style.line_key("pooled", CAPTURED, linestyle="--"),
         *(
-            Line2D([], [], marker="D", linestyle="", color=COLOURS[key], label=f"error, {words}")
+            style.line_key(f"error, {words}", COLOURS[key], marker="D", linestyle="")
             for key, words in ERROR_NAMES.items()
         ),
         columns=5,

@@ -18,8 +18,6 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 import jaxik
 from fitting.clips.assemble import JointMotion, clip_from_joints
@@ -27,6 +25,7 @@ from fitting.clips.clip import Clip
 from fitting.ground import ground_path
 from fitting.ground.ground_path import place_root
 from fitting.motion.measures import BOUNDED, MEASURES, VISIBLE, Bounded, PlacedMotion
+from fitting.report import style
 from fitting.report.document import (
     Document,
     Finding,
@@ -39,7 +38,7 @@ from fitting.report.document import (
     View,
 )
 from fitting.report.formatting import Table, listed, meanings
-from fitting.report.style import BEFORE, EARTH, GROUND, STAGES, earth, legend, styled
+from fitting.report.style import BEFORE, STAGES
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.synthetic import actions, walker
@@ -393,7 +392,7 @@ def _rows(scene: Scene) -> Table:
     return comparison.rows(scene.comparison, list(BOUNDED))
 
 
-@styled
+@style.styled
 def page(suite: Suite) -> Figure:
     """Ground, soles, ankles and pelvis of every system in every situation."""
     rows, columns = len(suite.scenes), len(suite.systems)
@@ -410,14 +409,14 @@ def page(suite: Suite) -> Figure:
     for system, axes in zip(suite.systems, panels[0], strict=True):
         axes.annotate(system, HEAD, xycoords="axes fraction", ha="center", fontsize=15)
     panels[-1, 0].set_xlabel("along the path, m", fontsize=9)
-    legend(
+    style.legend(
         figure,
-        Patch(facecolor=EARTH, edgecolor=GROUND, label="ground below the path"),
-        Line2D([], [], color=SOLES[0], label="left sole"),
-        Line2D([], [], color=SOLES[1], label="right sole"),
-        Line2D([], [], color=BEFORE, label="ankles"),
-        Line2D([], [], color="black", label="pelvis"),
-        Line2D([], [], color=RED, marker=".", linestyle="", label=OFF),
+        style.ground_key("ground below the path"),
+        style.line_key("left sole", SOLES[0]),
+        style.line_key("right sole", SOLES[1]),
+        style.line_key("ankles", BEFORE),
+        style.line_key("pelvis"),
+        style.line_key(OFF, RED, marker=".", linestyle=""),
         columns=across,
     )  # fmt: skip
     return figure
@@ -446,7 +445,7 @@ def _panel(axes: Axes, scene: Scene, system: str) -> None:
     points[:, 2] = middle + np.linspace(-reach, reach, SAMPLES)
     axes.set_xlim(points[0, 2], points[-1, 2])
     ground = ground_path.heights_under(scene.comparison.animation.terrain, points, ground_path.SKY)
-    earth(axes, points[:, 2], ground)
+    style.earth(axes, points[:, 2], ground)
     _title(axes, [_short(motion, bounded.name) for bounded in scene.beyond(system)])
 
 
@@ -455,11 +454,11 @@ def _short(motion: PlacedMotion, name: str) -> str:
     return f"{measure.heading} {measure.format(getattr(motion.measures, name))}{MISS}"
 
 
-def _line(axes: Axes, points: np.ndarray, **style: Any) -> None:
+def _line(axes: Axes, points: np.ndarray, **properties: Any) -> None:
     """A path from the side, interrupted where it jumps."""
     jumps = np.linalg.norm(np.diff(points, axis=0), axis=1) > JUMP
     broken = np.insert(points, np.flatnonzero(jumps) + 1, np.nan, axis=0)
-    axes.plot(broken[:, 2], broken[:, 1], **style)
+    axes.plot(broken[:, 2], broken[:, 1], **properties)
 
 
 def _heights(scene: Scene) -> tuple[float, float]:

@@ -8,8 +8,6 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from fitting.clips import Clip, load_clip
@@ -28,7 +26,7 @@ from fitting.ground.reconstruction import (
 from fitting.report import style
 from fitting.report.document import Document, Finding, Grid, Plot, Section, Text, text
 from fitting.report.formatting import Table, interval, joined
-from fitting.report.style import BEFORE, GROUND, STAGES, legend, styled
+from fitting.report.style import BEFORE, GROUND, STAGES, area_key, legend, line_key, styled
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 
@@ -274,17 +272,16 @@ def plan(terrain: Reconstruction, margin: float, legs: tuple[str, ...], title: s
     _draw_errors(upper, terrain.predictions)
     _draw_fractions(lower, terrain.predictions)
     marks = [
-        Line2D([], [], color="black", marker=mark, linestyle="", markerfacecolor="white", label=leg)
+        line_key(leg, marker=mark, linestyle="", markerfacecolor="white")
         for leg, mark in zip(legs, _marks(len(legs)), strict=True)
     ]
     entries: list[Artist] = [*marks]
     if not terrain.stances.used.all():
-        entries.append(Line2D([], [], color="black", marker="x", linestyle="", label="not used"))
+        entries.append(line_key("not used", marker="x", linestyle=""))
     if isinstance(terrain.surface, LevelBlocks):
-        entries.append(Patch(facecolor="white", edgecolor=BEFORE, hatch="///", label="not visited"))
+        entries.append(area_key("not visited", "white", edgecolor=BEFORE, hatch="///"))
     entries += [
-        Line2D([], [], color=COLOURS[kind], linewidth=3, label=f"predicted by {kind}")
-        for kind in SURFACE_KINDS
+        line_key(f"predicted by {kind}", COLOURS[kind], linewidth=3) for kind in SURFACE_KINDS
     ]
     legend(figure, *entries, columns=7)
     return figure

@@ -17,10 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array
-from matplotlib.axes import Axes
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 import jaxik
 from fitting import clips
@@ -41,7 +39,7 @@ from fitting.problem.space import free_parameter
 from fitting.report import style
 from fitting.report.document import Block, Grid, Plot, Points, Section, Text, brief
 from fitting.report.formatting import DIFFERENCES, Table, number, percent
-from fitting.report.style import AFTER, BEFORE, EARTH, legend, styled
+from fitting.report.style import AFTER, BEFORE, EARTH, area_key, legend, line_key, panels, styled
 from fitting.runtime import activity, files, validation
 from fitting.runtime.declarations import TABLE, Key, check_table
 from fitting.runtime.json_files import write_json
@@ -517,9 +515,7 @@ def difference(clip: Difference, source: str, target: str, title: str) -> Figure
         for name in DIFFERENCES
         if max(clip.correction[name].max(), clip.remaining[name].max()) > NEGLIGIBLE
     ]
-    figure = Figure(figsize=(17, 2.9 * max(len(names), 1) + 1.8), layout="constrained")
-    figure.suptitle(title)
-    rows = figure.subplots(max(len(names), 1), 1, sharex=True, squeeze=False)[:, 0]
+    figure, rows = panels(max(len(names), 1), 1, title, 2.9, 1.8, sharex=True)
     for axes, name in zip(rows, names, strict=False):
         kind = DIFFERENCES[name]
         of_legs = clip.remaining[name].shape[1] > 1
@@ -528,24 +524,17 @@ def difference(clip: Difference, source: str, target: str, title: str) -> Figure
         axes.set_title(kind.name.capitalize() + (" (the larger of the legs)" if of_legs else ""))
         axes.set_ylabel(kind.unit)
         axes.set_ylim(bottom=0)
-        _shade(axes, clip)
+        style.shade(axes, clip.time, clip.standing, EARTH)
     rows[-1].set_xlabel("time, s")
     rows[-1].set_xlim(clip.time[0], clip.time[-1])
-    entries: list[Line2D | Patch] = [
-        Line2D([], [], color=BEFORE, linewidth=3, label=f"{source} - animation: its correction"),
-        Line2D([], [], color=AFTER, linewidth=3, label=f"{source} - {target}: what remains"),
+    entries: list[Artist] = [
+        line_key(f"{source} - animation: its correction", BEFORE, linewidth=3),
+        line_key(f"{source} - {target}: what remains", AFTER, linewidth=3),
     ]
     if clip.standing.any():
-        entries.append(Patch(color=EARTH, label="the character stands"))
+        entries.append(area_key("the character stands", EARTH))
     legend(figure, *entries)
     return figure
-
-
-def _shade(axes: Axes, clip: Difference) -> None:
-    """Marks the time in which the character stands."""
-    edges = np.flatnonzero(np.diff(clip.standing.astype(int), prepend=0, append=0))
-    for start, end in edges.reshape(-1, 2):
-        axes.axvspan(float(clip.time[start]), float(clip.time[end - 1]), color=EARTH, zorder=0)
 
 
 @in_float64

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from scipy import special
 
 import jaxik
@@ -27,7 +25,7 @@ from fitting.problem.problem import Problem
 from fitting.report import pages
 from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
 from fitting.report.formatting import Table, counted, listed, percent
-from fitting.report.style import AFTER, BEFORE, CAPTURED, legend, panels, styled
+from fitting.report.style import AFTER, BEFORE, CAPTURED, area_key, legend, line_key, panels, styled
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
 from fitting.runtime.precision import in_float64
@@ -453,9 +451,9 @@ def ranks(tests: Mapping[str, RankTest], title: str) -> Figure:
     (test, *_) = tests.values()
     legend(
         figure,
-        Patch(color=AFTER, label="left: replicates by the rank of their truth"),
-        Line2D([], [], color=AFTER, label="right: ECDF of the ranks less the uniform one"),
-        Patch(color=BAND, label=f"95 % of each bar; {100 * test.level:.2f} % of whole curves"),
+        area_key("left: replicates by the rank of their truth", AFTER),
+        line_key("right: ECDF of the ranks less the uniform one", AFTER),
+        area_key(f"95 % of each bar; {100 * test.level:.2f} % of whole curves", BAND),
     )
     return figure
 
@@ -469,10 +467,10 @@ def recovery(fits: Sequence[ReplicateFit], title: str) -> Figure:
         _recovered(axes, fits, i)
     legend(
         figure,
-        Line2D([], [], marker="o", color=AFTER, label="fitted, 95 % interval"),
-        Line2D([], [], marker="o", color=CAPTURED, label="the interval misses the truth"),
-        Line2D([], [], marker="o", linestyle="", mfc="none", color=BEFORE, label="undetermined"),
-        Line2D([], [], color="black", linewidth=0.8, label="fitted = true"),
+        line_key("fitted, 95 % interval", AFTER, marker="o"),
+        line_key("the interval misses the truth", CAPTURED, marker="o"),
+        line_key("undetermined", BEFORE, marker="o", linestyle="", mfc="none"),
+        line_key("fitted = true", linewidth=0.8),
     )
     return figure
 

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatter
 
 from fitting.inference.optimise.solution import Progress
@@ -19,24 +18,9 @@ from fitting.motion.playback import Motion, Playback
 from fitting.motion.worst_window import WorstWindow
 from fitting.problem.scene import MEASURED
 from fitting.problem.space import FreeParameter, from_fractions, to_fractions
+from fitting.report import style
 from fitting.report.formatting import RESIDUALS
-from fitting.report.style import (
-    AFTER,
-    BEFORE,
-    CAPTURED,
-    EARTH,
-    GROUND,
-    LOCKED,
-    SLIDING,
-    STAGES,
-    STANDING,
-    earth,
-    legend,
-    sections,
-    steepest_part,
-    styled,
-    whole_and_part,
-)
+from fitting.report.style import AFTER, BEFORE, CAPTURED, LOCKED, SLIDING, STAGES, STANDING
 
 RISE = 1e-6  # relative, of the lowest cost: more than rounding
 LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
@@ -55,7 +39,7 @@ STANCE_ALPHA = 0.22
 UNSEEN = "#dddddd"
 
 
-@styled
+@style.styled
 def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """Heights of ankles and pelvis over time above the ground; whole clip and a part of it."""
     figure, columns = _whole_and_part(playback, len(legs) + 1, title)
@@ -65,31 +49,30 @@ def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
             _plot_motions(
                 axes, playback, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg])
             )
-            earth(axes, playback.time, ground[:, leg])
+            style.earth(axes, playback.time, ground[:, leg])
             axes.set_title(
                 f"{name.capitalize()} ankle, with the ground under it ({playback.label})"
             )
         _plot_motions(panels[-1], playback, lambda motion: 100 * playback.height(motion.pelvis))
-        earth(panels[-1], playback.time, ground.mean(axis=1))
+        style.earth(panels[-1], playback.time, ground.mean(axis=1))
         panels[-1].set_title("Pelvis, with the mean ground under the feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
-    legend(figure, *_lines(playback), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
+    style.legend(figure, *_lines(playback), style.ground_key())
     return figure
 
 
-@styled
+@style.styled
 def side_view(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """Legs seen from the side, in the part of the clip that climbs most."""
-    start, end = steepest_part(playback.time, playback.height(playback.captured.pelvis))
+    start, end = style.steepest_part(playback.time, playback.height(playback.captured.pelvis))
     inside = slice(start, end + 1)
     travelled = playback.travelled[inside]
     spacing = max(LEG_SPACING, (np.max(travelled) - np.min(travelled)) / 20)
     chosen = start + np.unique(np.floor((travelled - travelled[0]) / spacing), return_index=True)[1]
     tall = np.clip(16.0 * 1.35 / (np.ptp(travelled) + 1.6), 2.2, 6.5)
-    figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
-    figure.suptitle(f"{title}, seen from the right, {_seconds(playback, start, end)}")
-    rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    title = f"{title}, seen from the right, {_seconds(playback, start, end)}"
+    figure, rows = style.panels(len(legs), 1, title, tall + 0.7, 1.4, sharex=True, sharey=True)
     for leg, (axes, name) in enumerate(zip(rows, legs, strict=True)):
         for colour, motion in _motions(playback):
             joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)[:, leg]
@@ -100,19 +83,19 @@ def side_view(playback: Playback, legs: Sequence[str], title: str) -> Figure:
             axes.plot(*pelvis, color=colour, linewidth=2.6)
         along = playback.along(playback.ground_ws)[inside, leg]
         order = np.argsort(along, kind="stable")
-        earth(axes, along[order], playback.ground_height()[inside, leg][order])
+        style.earth(axes, along[order], playback.ground_height()[inside, leg][order])
         axes.set_aspect("equal")
         axes.set_title(
             f"{name.capitalize()} leg every {100 * spacing:.0f} cm, and the path of the pelvis"
         )
         axes.set_ylabel("height, m")
     rows[-1].set_xlabel("distance travelled, m")
-    ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
-    legend(figure, *_lines(playback), ground)
+    ground = style.ground_key("ground under this foot's track")
+    style.legend(figure, *_lines(playback), ground)
     return figure
 
 
-@styled
+@style.styled
 def knees(playback: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
     """Knee angles over time with the fitted limits; whole clip and a part of it."""
     figure, columns = _whole_and_part(playback, len(legs), title)
@@ -130,19 +113,17 @@ def knees(playback: Playback, legs: Sequence[str], limits: Sequence[float], titl
     for axes in columns[0]:
         axes.set_ylabel("knee angle, degrees")
     if limits:
-        lines.append(Line2D([], [], **SIGMA, label="limits"))
-    legend(figure, *lines)
+        lines.append(style.line_key("limits", **SIGMA))
+    style.legend(figure, *lines)
     return figure
 
 
-@styled
+@style.styled
 def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
     """Errors of each kind over time, and their distribution against the assumed sigma."""
     kinds = fitted.fitted_kinds
-    figure = Figure(figsize=(17, 3.0 * len(kinds) + 1.8), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
-    for (axes, side), kind in zip(grid, kinds, strict=True):
+    figure, panels = style.panels(2 * len(kinds), 2, title, 3.0, 1.8, width_ratios=[2.4, 1])
+    for axes, side, kind in zip(panels[::2], panels[1::2], kinds, strict=True):
         name, unit, factor = RESIDUALS[kind]
         for playback, colour in ((first, BEFORE), (fitted, AFTER)):
             size = factor * _size(playback, kind)
@@ -155,18 +136,18 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
         axes.set_ylim(bottom=0)
         _distribution(side, np.asarray(first.residuals[kind]), np.asarray(fitted.residuals[kind]))
         side.set_title(f"{name}: distribution of the residuals")
-    grid[-1, 0].set_xlabel("time, s")
-    grid[-1, 1].set_xlabel("residual, in sigmas")
-    legend(
+    panels[-2].set_xlabel("time, s")
+    panels[-1].set_xlabel("residual, in sigmas")
+    style.legend(
         figure,
-        Line2D([], [], color=BEFORE, linewidth=3, label="preset parameters"),
-        Line2D([], [], color=AFTER, linewidth=3, label="fitted parameters"),
-        Line2D([], [], **SIGMA, label="assumed sigma; right: normal distribution"),
+        style.line_key("preset parameters", BEFORE, linewidth=3),
+        style.line_key("fitted parameters", AFTER, linewidth=3),
+        style.line_key("assumed sigma; right: normal distribution", **SIGMA),
     )
     return figure
 
 
-@styled
+@style.styled
 def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """When each foot stands and locks, as lanes; the whole clip and a part of it."""
     labelled, locking = bool(np.any(playback.stance)), bool(np.any(playback.locked))
@@ -181,30 +162,28 @@ def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
             )
     if np.any(playback.slide):
         lanes.append(("sliding", SLIDING, np.asarray(playback.slide)))
-    parts = sections(playback.time, playback.height(playback.captured.pelvis))
-    tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
-    figure = Figure(figsize=(17, tall), layout="constrained")
-    figure.suptitle(title if locking else f"{title} (no foot ever locks)")
-    rows = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
+    parts = style.sections(playback.time, playback.height(playback.captured.pelvis))
+    title = title if locking else f"{title} (no foot ever locks)"
+    figure, rows = style.panels(len(parts), 1, title, 0.55 * len(lanes) + 1.3, 1.3)
     for axes, (start, end) in zip(rows, parts, strict=True):
         _draw_lanes(axes, playback.time, lanes)
         axes.set_xlim(playback.time[start], playback.time[end])
         whole = (start, end) == parts[0]
         axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(playback, start, end)}")
         axes.set_xlabel("time, s")
-    released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
+    released = style.line_key("released", marker="v", linestyle="")
     entries = [
-        (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
-        (locking, Patch(color=LOCKED, label="foot locked")),
+        (True, style.area_key("contact weight, 0 to 1", STANDING)),
+        (locking, style.area_key("foot locked", LOCKED)),
         (locking, released),
-        (labelled, Patch(color=CAPTURED, label=f"stance, {playback.label}")),
-        (bool(np.any(playback.slide)), Patch(color=SLIDING, label="sliding")),
+        (labelled, style.area_key(f"stance, {playback.label}", CAPTURED)),
+        (bool(np.any(playback.slide)), style.area_key("sliding", SLIDING)),
     ]
-    legend(figure, *(entry for visible, entry in entries if visible))
+    style.legend(figure, *(entry for visible, entry in entries if visible))
     return figure
 
 
-@styled
+@style.styled
 def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
     """Cost of the fit over time, by stage, and the best so far.
 
@@ -238,7 +217,7 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
         ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
     axes.set_xlabel("time since the fit began, compilation included, s")
     axes.set_ylabel("cost: half the sum of squared residuals")
-    legend(figure, *axes.get_legend_handles_labels()[0])
+    style.legend(figure, *axes.get_legend_handles_labels()[0])
     return figure
 
 
@@ -249,13 +228,13 @@ def _lines(playback: Playback) -> list[Line2D]:
         (AFTER, "after fitted foot IK"),
         (CAPTURED, playback.label),
     )
-    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in motions]
+    return [style.line_key(label, colour, linewidth=3) for colour, label in motions]
 
 
 def _whole_and_part(playback: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
     figure = Figure(figsize=(17, 3.4 * rows + 1.6), layout="constrained")
     figure.suptitle(title)
-    return figure, whole_and_part(
+    return figure, style.whole_and_part(
         figure, playback.time, playback.height(playback.captured.pelvis), rows
     )
 
@@ -296,13 +275,16 @@ def _distribution(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
         if values.size:
             density = np.histogram(values, edges, density=True)[0]
             axes.stairs(density, edges, fill=fill, color=colour, alpha=0.45 if fill else 1.0)
-    curve = np.linspace(-5.0, 5.0, 201)
-    axes.plot(
-        curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black", linewidth=1.4
-    )
+    _draw_normal(axes, 5.0)
     axes.set_xlim(-5.6, 5.6)
     axes.set_xticks([-5, -2.5, 0, 2.5, 5], ["≤−5", "−2.5", "0", "2.5", "≥5"])
     axes.set_ylabel("density")
+
+
+def _draw_normal(axes: Axes, end: float) -> None:
+    """The density of the normal distribution from -end to end."""
+    x = np.linspace(-end, end, 321)
+    axes.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), "--", color="black")
 
 
 def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np.ndarray]]) -> None:
@@ -323,26 +305,25 @@ def _seconds(playback: Playback, start: int, end: int) -> str:
     return f"{playback.time[start]:.1f} s to {playback.time[end]:.1f} s"
 
 
-@styled
+@style.styled
 def noise(playback: Playback, title: str) -> Figure:
     """Autocorrelation and distribution of the residuals of each measured kind."""
     kinds = [kind for kind in playback.fitted_kinds if kind in MEASURED]
-    figure = Figure(figsize=(17, 2.6 * len(kinds) + 1.8), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.subplots(max(len(kinds), 1), 2, squeeze=False, width_ratios=[1.6, 1])
-    for (left, right), kind in zip(grid, kinds, strict=False):
+    count = 2 * max(len(kinds), 1)
+    figure, panels = style.panels(count, 2, title, 2.6, 1.8, width_ratios=[1.6, 1])
+    for left, right, kind in zip(panels[::2], panels[1::2], kinds, strict=False):
         _, residuals, active = goodness.series(playback, kind)
         _draw_autocorrelation(left, residuals, active, float(np.median(playback.dt)))
         left.set_title(f"{RESIDUALS[kind].name}: correlation with later residuals")
         _draw_tails(right, residuals, active)
         right.set_title(f"{RESIDUALS[kind].name}: distribution")
-    grid[-1, 0].set_xlabel("seconds later")
-    grid[-1, 1].set_xlabel("residual, in standard deviations (from the median)")
-    legend(
+    panels[-2].set_xlabel("seconds later")
+    panels[-1].set_xlabel("residual, in standard deviations (from the median)")
+    style.legend(
         figure,
-        Line2D([], [], color=AFTER, linewidth=3, label="residuals of the fit"),
-        Line2D([], [], color=BEFORE, linewidth=3, label="left: 95 % of white noise"),
-        Line2D([], [], color="black", linestyle="--", label="right: normal distribution"),
+        style.line_key("residuals of the fit", AFTER, linewidth=3),
+        style.line_key("left: 95 % of white noise", BEFORE, linewidth=3),
+        style.line_key("right: normal distribution", linestyle="--"),
     )
     return figure
 
@@ -367,15 +348,14 @@ def _draw_tails(axes: Axes, residuals: np.ndarray, active: np.ndarray) -> None:
         values = np.clip(residuals[active] / scale, -WIDEST + 1e-9, WIDEST - 1e-9)
         density = np.histogram(values, edges, density=True)[0]
         axes.stairs(density, edges, fill=True, color=AFTER, alpha=0.6)
-    curve = np.linspace(-WIDEST, WIDEST, 321)
-    axes.plot(curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black")
+    _draw_normal(axes, WIDEST)
     axes.set_yscale("log")
     axes.minorticks_off()  # drawing them takes a quarter of the time of the picture
     axes.set_ylim(1e-5, 1.0)
     axes.set_ylabel("density")
 
 
-@styled
+@style.styled
 def profiles(
     parameters: Mapping[str, FreeParameter],
     curves: Mapping[str, Profile],
@@ -384,13 +364,10 @@ def profiles(
     title: str,
 ) -> Figure:
     """Each parameter's profile: on the left over its whole range, on the right its interval."""
-    lines = -(-len(curves) // PER_ROW)
-    figure = Figure(figsize=(17, 2.35 * lines + 1.6), layout="constrained")
-    figure.suptitle(title)
     ratios = [1.25, 1.0] * PER_ROW
-    grid = figure.subplots(lines, 2 * PER_ROW, squeeze=False, width_ratios=ratios)
-    panels = grid.reshape(-1, 2)
-    for (whole, part), (name, curve) in zip(panels, curves.items(), strict=False):
+    count, columns = 2 * len(curves), 2 * PER_ROW
+    figure, panels = style.panels(count, columns, title, 2.35, 1.6, width_ratios=ratios)
+    for whole, part, (name, curve) in zip(panels[::2], panels[1::2], curves.items(), strict=True):
         true = (truth or {}).get(name)
         for axes in (whole, part):
             _draw(axes, parameters[name], curve, true)
@@ -398,17 +375,15 @@ def profiles(
         _interval(part, parameters[name], curve)
         whole.set_title(f"{name}: {curve.verdict}")
         part.set_xlabel("" if units[name] == "1" else units[name], labelpad=1)
-    for axes in panels[len(curves) :].ravel():
-        axes.set_visible(False)
     entries = [
-        Line2D([], [], color=AFTER, linewidth=3, label="rise of the lowest cost"),
-        Line2D([], [], color=BEFORE, linestyle="--", label="the prior's part of it"),
-        Patch(color=AFTER, alpha=0.18, label="95 % interval"),
-        Line2D([], [], color="black", linestyle=":", label="rise at its ends"),
+        style.line_key("rise of the lowest cost", AFTER, linewidth=3),
+        style.line_key("the prior's part of it", BEFORE, linestyle="--"),
+        style.area_key("95 % interval", AFTER, alpha=0.18),
+        style.line_key("rise at its ends", linestyle=":"),
     ]
     if truth:
-        entries.append(Line2D([], [], color=CAPTURED, linewidth=2.2, label="truth"))
-    legend(figure, *entries, columns=5)
+        entries.append(style.line_key("truth", CAPTURED, linewidth=2.2))
+    style.legend(figure, *entries, columns=5)
     return figure
 
 
@@ -451,17 +426,14 @@ def _label_values(axes: Axes, parameter: FreeParameter, places: list[float]) -> 
     axes.set_xticks(places, [f"{value:.4g}" for value in values], fontsize=10)
 
 
-@styled
+@style.styled
 def worst_window(
     playback: Playback, legs: Sequence[str], window: WorstWindow, title: str
 ) -> Figure:
     """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
     inside = slice(window.start, window.end + 1)
     time = playback.time[inside]
-    rows = 2 * len(legs) + 1
-    figure = Figure(figsize=(17, 3.1 * rows + 1.6), layout="constrained")
-    figure.suptitle(title)
-    panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    figure, panels = style.panels(2 * len(legs) + 1, 1, title, 3.1, 1.6, sharex=True)
     ground = 100 * playback.ground_height()[inside]
 
     def draw(axes: Axes, series: Callable[[Motion], np.ndarray]) -> None:
@@ -471,45 +443,32 @@ def worst_window(
     for leg, name in enumerate(legs):
         foot, knee = panels[leg], panels[len(legs) + 1 + leg]
         draw(foot, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg]))
-        earth(foot, time, ground[:, leg])
+        style.earth(foot, time, ground[:, leg])
         foot.set_title(f"{name.capitalize()} ankle, with the ground under it ({playback.label})")
         draw(knee, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
         knee.set_title(f"{name.capitalize()} knee (180° is straight)")
         knee.set_ylabel("knee angle, degrees")
         for axes in (foot, knee):
             stance = np.asarray(playback.stance)[inside, leg] > 0.5
-            _shade(axes, time, stance, color=STANDING, alpha=STANCE_ALPHA)
+            style.shade(axes, time, stance, STANDING, STANCE_ALPHA)
     pelvis = panels[len(legs)]
     draw(pelvis, lambda motion: 100 * playback.height(motion.pelvis))
     pelvis.set_title("Pelvis")
     for axes in panels[: len(legs) + 1]:
         axes.set_ylabel("height, cm")
     for axes in panels:
-        _shade(axes, time, ~np.asarray(playback.seen)[inside], color=UNSEEN)
+        style.shade(axes, time, ~np.asarray(playback.seen)[inside], UNSEEN)
         axes.axvline(playback.time[window.frame], color="black", linestyle=":", linewidth=1.6)
     panels[-1].set_xlabel("time, s")
     panels[-1].set_xlim(time[0], time[-1])
     entries = [
-        Line2D([], [], color=CAPTURED, linewidth=3, label=playback.label),
-        Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
-        Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"),
-        Patch(color=STANDING, alpha=STANCE_ALPHA, label="captured stance"),
-        Line2D([], [], color="black", linestyle=":", label="largest error"),
+        style.line_key(playback.label, CAPTURED, linewidth=3),
+        style.line_key("after fitted foot IK", AFTER, linewidth=3),
+        style.ground_key(),
+        style.area_key("captured stance", STANDING, alpha=STANCE_ALPHA),
+        style.line_key("largest error", linestyle=":"),
     ]
     if not np.all(np.asarray(playback.seen)[inside]):
-        entries.append(Patch(color=UNSEEN, label="left out of the fit"))
-    legend(figure, *entries, columns=6)
+        entries.append(style.area_key("left out of the fit", UNSEEN))
+    style.legend(figure, *entries, columns=6)
     return figure
-
-
-def _shade(
-    axes: Axes, time: np.ndarray, mask: np.ndarray, *, color: str, alpha: float = 1.0
-) -> None:
-    """Colours the whole height of the axes where the mask is true."""
-    half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0))
-    for start, end in edges.reshape(-1, 2):
-        axes.axvspan(
-            float(time[start]) - half, float(time[end - 1]) + half,
-            color=color, alpha=alpha, linewidth=0, zorder=0,
-        )  # fmt: skip

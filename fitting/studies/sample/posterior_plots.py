@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from scipy.ndimage import gaussian_filter
 
 from fitting.inference.sample.posterior import Posterior
 from fitting.problem.space import Space, prior_probability
-from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, styled
+from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, line_key, styled
 
 SAMPLES = 20_000  # at most, in the corner
 WALKERS = 40  # at most, in the picture of the chain
@@ -70,14 +69,14 @@ def corner(
             axes.stairs(expected[:, i], edges[:, i], color=PRIOR, linewidth=1.8)
             axes.set_ylim(0, max(axes.get_ylim()[1], 1.1 * expected[:, i].max()))
     entries = [
-        Line2D([], [], color=AFTER, linewidth=4, label="posterior: contours hold 39 % and 86 %"),
-        Line2D([], [], color=AFTER, linestyle="--", label="ends of the 95 % interval"),
-        Line2D([], [], color=BEFORE, linestyle="--", linewidth=1.8, label="best fit"),
+        line_key("posterior: contours hold 39 % and 86 %", AFTER, linewidth=4),
+        line_key("ends of the 95 % interval", AFTER, linestyle="--"),
+        line_key("best fit", BEFORE, linestyle="--", linewidth=1.8),
     ]
     if space is not None:
-        entries.append(Line2D([], [], color=PRIOR, linewidth=1.8, label="prior"))
+        entries.append(line_key("prior", PRIOR, linewidth=1.8))
     if truth:
-        entries.append(Line2D([], [], color=CAPTURED, linewidth=1.8, label="truth"))
+        entries.append(line_key("truth", CAPTURED, linewidth=1.8))
     legend_size = np.clip(1.1 * inches, 12, 24)
     figure.suptitle(title, fontsize=1.3 * legend_size, x=0.98, ha="right")
     figure.legend(
@@ -157,15 +156,13 @@ def chain(
     for lowest in {*range(rows - 1, len(panels), rows), len(panels) - 1}:
         grid.T.flat[lowest].set_xlabel("step of the sampler")
     entries = [
-        Line2D(
-            [], [], color=AFTER, label=f"walkers ({len(drawn)} of {posterior.u.shape[1]} shown)"
-        ),
-        Line2D([], [], color="#dddddd", linewidth=8, label="burn-in, discarded"),
+        line_key(f"walkers ({len(drawn)} of {posterior.u.shape[1]} shown)", AFTER),
+        line_key("burn-in, discarded", "#dddddd", linewidth=8),
     ]
     if truth:
-        entries.append(Line2D([], [], color=CAPTURED, linewidth=2.0, label="truth"))
+        entries.append(line_key("truth", CAPTURED, linewidth=2.0))
     if posterior.stuck:
-        entries.append(Line2D([], [], color="black", label="stuck walkers"))
+        entries.append(line_key("stuck walkers"))
     figure.legend(handles=entries, loc="outside lower center", ncols=4)
     return figure
 

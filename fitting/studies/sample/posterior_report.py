@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
 from fitting.inference.sample.diagnostics import ParameterSummary
@@ -30,7 +29,7 @@ from fitting.report.document import (
     brief,
 )
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
-from fitting.report.style import AFTER, CAPTURED, legend, styled
+from fitting.report.style import AFTER, CAPTURED, legend, line_key, styled
 from fitting.runtime import activity
 from fitting.studies.fit import goodness_report
 from fitting.studies.fit.fit_tables import Truth
@@ -213,9 +212,9 @@ def bands(channels: Sequence[Band], title: str) -> Figure:
         axes.set_xlabel("time, s")
     legend(
         figure,
-        Line2D([], [], color=CAPTURED, linewidth=2, label="captured"),
-        Line2D([], [], color=AFTER, linewidth=8, alpha=0.3, label="95 % of the replicates"),
-        Line2D([], [], color=AFTER, linewidth=2, label="median motion of the posterior"),
+        line_key("captured", CAPTURED, linewidth=2),
+        line_key("95 % of the replicates", AFTER, linewidth=8, alpha=0.3),
+        line_key("median motion of the posterior", AFTER, linewidth=2),
     )
     return figure
 
