@@ -38,7 +38,7 @@ from fitting.motion import playback
 from fitting.report import document, pages
 from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
-from fitting.studies.fit import assess, fit_jobs, fit_report, identifiability_report, run_folder
+from fitting.studies.fit import assess, fit_jobs, fit_report, fit_tables, run_folder
 from fitting.studies.sample import posterior_report, replay, sample_jobs
 from jaxik.maths import parameter_tree
 from support import quick
@@ -67,7 +67,7 @@ FIT_WORK = [
     ("Drawing the curves of the parameters", (fit_report, "_draw_search")),
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
     ("Measuring where limits are in effect", (fit_report.playback, "measure_activity"), PLAY),
-    ("Finding what determines 2 parameters", (identifiability_report, "find_evidence"), PLAY),
+    ("Finding what determines 2 parameters", (fit_tables, "find_evidence"), PLAY),
     ("Writing the page", (document.Document, "write")),
     ("Finishing the pictures",),
 ]

@@ -24,7 +24,7 @@ from .options import (
     rate,
     terrain_options,
 )
-from .progress import interruptible
+from .start import interruptible
 
 EXPERIMENT = argument(
     "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"

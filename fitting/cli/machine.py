@@ -10,7 +10,7 @@ from fitting.runtime import activity
 
 from . import status
 from .options import argument, command, flag
-from .progress import interruptible
+from .start import interruptible
 from .terminal import show
 
 SHELLS = ("bash", "zsh", "tcsh", "fish", "powershell")  # that shtab knows

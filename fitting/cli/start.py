@@ -9,8 +9,11 @@ import atexit
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+
+from fitting.runtime import activity
 
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
 AGAIN = 0.05  # s until an interrupt that was lost is raised again
@@ -66,6 +69,40 @@ def _raise_again(unraisable: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(unraisable)
     elif signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         import _thread
-        import threading
 
         threading.Timer(AGAIN, _thread.interrupt_main).start()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Inside this context no Ctrl-C is lost, and the second one ends the process at once.
+
+    One that arrives while Python collects garbage ends in a hook of JAX that swallows it; it is
+    raised again at the next report.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    interrupts = _Interrupts()
+    signal.signal(signal.SIGINT, interrupts.interrupt)
+    try:
+        with activity.watched_by(interrupts):
+            yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+class _Interrupts(activity.Watcher):
+    interrupted = False
+
+    def interrupt(self, *_: object) -> None:
+        if self.interrupted:
+            end()
+        self.interrupted = True
+        say("interrupted; ending what is being computed; Ctrl-C again stops at once")
+        raise KeyboardInterrupt
+
+    def reported(self, result: object) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt

@@ -41,7 +41,7 @@ from jaxik.world import body
 from jaxik.world.body import scaled_declarations
 
 from . import terrain_report
-from .fit import capture_check, goodness_report
+from .fit import capture_check, fit_tables
 from .fit.capture_check import CaptureCheck, stances_of
 from .output import output_folder
 from .terrain_report import SCATTER
@@ -427,7 +427,7 @@ def document(draft: Draft) -> Document:
         assumed += [Heading(entry.reference.name, brief=True), Grid(table, "What is assumed")]
     as_it_comes: list[Block] = [
         Text(AS_IT_COMES.format(experiment.preset), brief=True),
-        Grid(goodness_report.distances_of_preset(draft.distances), "Distances from the capture"),
+        Grid(fit_tables.distances_of_preset(draft.distances), "Distances from the capture"),
     ]
     return Document(
         file="",

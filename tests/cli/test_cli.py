@@ -19,7 +19,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from fitting.cli import machine, main, progress, start
+from fitting.cli import machine, main, start
 from fitting.cli.parser import make_parser
 from fitting.clips import formats, load_clip, save_clip
 from fitting.clips.clip_frames import raised
@@ -162,7 +162,7 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_second_one_ends_
     monkeypatch.setattr(start, "end", ended)
 
     report = Progress("start", 0, 0, 1.0, 1.0, 0.0)
-    with progress.interruptible():
+    with start.interruptible():
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         assert "Ctrl-C again stops at once" in capfd.readouterr().err

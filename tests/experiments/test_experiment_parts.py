@@ -22,7 +22,7 @@ from fitting.problem.scene import legs_ws, pelvis_ws
 from fitting.report.document import Grid, Text
 from fitting.studies import ablation, animations
 from fitting.studies.animations import AnimationFiles
-from fitting.studies.fit import fit_jobs, record_price
+from fitting.studies.fit import fit_jobs
 from fitting.studies.fit.fit import Fit
 from jaxik import presets, record
 from jaxik.maths import parameter_tree
@@ -369,8 +369,8 @@ def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkey
         searches.append((settings.fit.starts, *problem.space.values(start)))
         return SimpleNamespace(u=start + [0.0, 0.0, 2.0], cost=2.0, interrupted=False)
 
-    monkeypatch.setattr(record_price, "search", search)
-    price = record_price.measure(fitted)
+    monkeypatch.setattr(fit_jobs, "search", search)
+    price = fit_jobs.measure_record_price(fitted)
     assert price is not None and searches == [pytest.approx((1, 0.4, -0.05, 0.1))]
     assert (price.left_out, price.cost, price.whole_cost) == (("target.rise_half_life",), 3.0, 2.0)
     play = playback.play(scene, playback.run(fitted.ik, scene))

@@ -35,7 +35,7 @@ from fitting.report import document, pages
 from fitting.report.document import Grid, Section, Text
 from fitting.report.formatting import markdown
 from fitting.runtime import display
-from fitting.studies.fit import fit_report, goodness_report, identifiability_report, run_folder
+from fitting.studies.fit import fit_report, fit_tables, run_folder
 from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import posterior_plots, posterior_report, sample_jobs
@@ -190,14 +190,14 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert centre is not None and centre == pytest.approx(planted["before"])
     u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
     np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
-    text = "\n".join(document.markdown([identifiability_report.prior_section(rows)]))
+    text = "\n".join(document.markdown([fit_tables.prior_section(rows)]))
     low, high = planted["prior"]["interval"]
     assert line_of(text, "contact.planted_height") == (
         f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
         "| 0.1 to 0.12 |"
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
-    section = identifiability_report.prior_section(fitted.summary["parameters"])
+    section = fit_tables.prior_section(fitted.summary["parameters"])
     text = "\n".join(document.markdown([section]))
     assert "| normal | 0.9667 (system: 1) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
@@ -259,7 +259,7 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     # What a translation leaves is measured in tolerances.
     of_source = replace(fitted, has_noise=False)
     assert of_source.verdict.sentence.startswith(("Not the same motion: ", "The same motion"))
-    *_, tolerances = goodness_report.goodness_blocks(of_source)
+    *_, tolerances = fit_tables.goodness_blocks(of_source)
     assert isinstance(tolerances, Grid) and "error, rms" in tolerances.rows[0]
 
 
@@ -612,7 +612,7 @@ def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_sys
     text = fit_report.fit_text(shown)
     system, _, capture = text.partition("What is not known of the captures")
     assert "contact.planted_height" in capture and "contact.planted_height" not in system
-    sentences = goodness_report.sentences(shown)
+    sentences = fit_tables.sentences(shown)
     assert [line in text for line in sentences] == [True] * 3
     assert sentences[0] == (
         "Standing feet are 2.9 cm in the ground in the median of 14 stances, which scatter by "
@@ -624,7 +624,7 @@ def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_sys
     assert section.startswith("## The capture") and "contact.planted_height" in section
     freed = replace(shown, experiment=replace(shown.experiment, capture={"time_shift": {}}))
     vars(freed)["capture_signs"] = vars(shown)["capture_signs"]
-    assert len(goodness_report.sentences(freed)) == 2  # what is fitted needs no remedy
+    assert len(fit_tables.sentences(freed)) == 2  # what is fitted needs no remedy
     vars(freed)["capture_signs"] = [CaptureSigns(GroundOffset(0.0, 0.01, 14), 0.0)] * 2
-    assert goodness_report.sentences(freed) == []
+    assert fit_tables.sentences(freed) == []
     assert list(document.markdown([fit_report._capture(fitted)])) == []

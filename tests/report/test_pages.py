@@ -25,12 +25,7 @@ from fitting.report import document, formatting, motion_data, pages
 from fitting.report.document import Document, Finding, Grid, Points, Section, Text
 from fitting.report.style import save
 from fitting.studies import animations, comparison
-from fitting.studies.fit import (
-    fit_motions,
-    fit_plots,
-    fit_report,
-    identifiability_report,
-)
+from fitting.studies.fit import fit_motions, fit_plots, fit_report, fit_tables
 from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
@@ -134,7 +129,7 @@ def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cau
 
 
 def describe(play) -> str:
-    return " ".join(identifiability_report.describe(play, find_worst_window(play), LEGS))
+    return " ".join(fit_tables.describe_window(play, find_worst_window(play), LEGS))
 
 
 def test_the_text_gives_direction_size_and_time_of_the_largest_error():
@@ -297,7 +292,7 @@ def test_the_page_says_what_was_found(page, fitted):
     assert fitted.verdict.sentence.replace("`", "") in page.text
     (play,) = fitted.playbacks
     window = worst_window.find_worst_window(play)
-    for line in identifiability_report.describe(play, window, ("left", "right")):
+    for line in fit_tables.describe_window(play, window, ("left", "right")):
         assert line in page.text
     assert "leg.max_knee_angle 50.0 %" in page.text
     assert "never act in these clips: pelvis.limit." in page.text

@@ -39,7 +39,7 @@ from fitting.runtime.beside import calls_beside
 from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 
-from . import fit_motions, fit_plots, fit_tables, goodness_report, identifiability_report
+from . import fit_motions, fit_plots, fit_tables
 from .assess import MIN_IMPROVEMENT
 from .fit import Fit
 from .fit_motions import ClipMotions, WarmUp
@@ -124,7 +124,7 @@ def fit_document(
     sections = [
         Section("What these clips can tell", [Points(fitted.check.lines)]),
         *opening,
-        Section("Goodness of fit", goodness_report.goodness_blocks(fitted), on_page=False),
+        Section("Goodness of fit", fit_tables.goodness_blocks(fitted), on_page=False),
         _parameters(fitted),
         _capture(fitted),
         _distances(fitted, motions),
@@ -275,14 +275,14 @@ def _capture(fitted: Fit) -> Section:
         [
             Text(words if ranges.rows else "", brief=True),
             ranges,
-            Points(goodness_report.sentences(fitted), brief=True),
+            Points(fit_tables.sentences(fitted), brief=True),
         ],
     )
 
 
 def _distances(fitted: Fit, motions: Sequence[ClipMotions]) -> Section:
     blocks: list[Block] = [
-        Grid(goodness_report.distance_table(fitted.distances), "Distances from the captured motion")
+        Grid(fit_tables.distance_table(fitted.distances), "Distances from the captured motion")
     ]
     if motions:
         accuracies = fit_motions.summarised(motions)
@@ -306,7 +306,7 @@ def _worst(fitted: Fit) -> Section:
     plays = zip(fitted.playbacks, fitted.problem.data, strict=True)
     for index, (play, scene) in enumerate(plays):
         window = worst_window.find_worst_window(play)
-        lines = identifiability_report.describe(play, window, scene.rig.names)
+        lines = fit_tables.describe_window(play, window, scene.rig.names)
         if len(fitted.playbacks) > 1:
             blocks.append(Heading(fitted.experiment.clips[index].reference.name))
         blocks += [Points(lines), Jump("Show them in the view", index)]
@@ -316,9 +316,9 @@ def _worst(fitted: Fit) -> Section:
 def _determined(fitted: Fit, activities: Sequence[ClipActivity]) -> list[Section]:
     if not fitted.experiment.free_count:
         return []
-    blocks = identifiability_report.determined_blocks(fitted, len(activities))
+    blocks = fit_tables.determined_blocks(fitted, len(activities))
     return [
-        identifiability_report.prior_section(fitted.summary["parameters"]),
+        fit_tables.prior_section(fitted.summary["parameters"]),
         Section("What these clips determine", blocks, on_page=False),
     ]
 
@@ -345,7 +345,7 @@ def _activity(measured: Measured) -> Section:
 
 
 def _limits(fitted: Fit, activities: Sequence[ClipActivity]) -> Section:
-    missing = identifiability_report.missing_motion(fitted, activities)
+    missing = fit_tables.missing_motion(fitted, activities)
     blocks: list[Block] = []
     if missing:
         blocks.append(Text("What a clip would have to show to determine the rest:"))

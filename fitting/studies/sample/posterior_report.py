@@ -31,13 +31,12 @@ from fitting.report.document import (
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
 from fitting.report.style import AFTER, CAPTURED, legend, line_key, styled
 from fitting.runtime import activity
-from fitting.studies.fit import goodness_report
+from fitting.studies.fit import fit_tables
 from fitting.studies.fit.fit_tables import Truth
 from fitting.studies.fit.run_folder import LOWER_POINT
 
 from . import posterior_plots
-from .predictive import SURPRISING, Band, Disagreement, PredictiveCheck, Statistic
-from .replay import Replay
+from .replay import SURPRISING, Band, Disagreement, PredictiveCheck, Replay, Statistic
 from .sample import SampledFit
 
 TEXT = "posterior.md"
@@ -104,7 +103,7 @@ def sections(sampled: SampledFit, run: Path | None) -> list[Section]:
     if posterior.sigmas:
         blocks += [
             Text("Sigmas of the noise, which were sampled along:"),
-            Grid(goodness_report.sigma_table(posterior.sigmas), "Sampled sigmas"),
+            Grid(fit_tables.sigma_table(posterior.sigmas), "Sampled sigmas"),
         ]
     if truth:
         determined = [name for name, row in rows.items() if row["determined"]]

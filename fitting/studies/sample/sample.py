@@ -25,8 +25,7 @@ from fitting.problem.space import Space
 from fitting.studies.fit.assess import MIN_IMPROVEMENT
 from fitting.studies.fit.fit import FittedParameter, PriorSummary, summarise_priors
 
-from .predictive import Disagreement, disagreements
-from .replay import Replay
+from .replay import Disagreement, Replay, disagreements
 
 SEPARATION = 3.0  # widths of the walkers' ball between places where some of them start
 

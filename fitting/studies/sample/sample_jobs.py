@@ -26,8 +26,7 @@ from fitting.studies.fit.fit import Fit
 from fitting.studies.output import log_output, output_folder
 
 from .posterior_report import posterior_text, write_posterior
-from .predictive import Band, PredictiveCheck, Statistic
-from .replay import Replay, replay
+from .replay import Band, PredictiveCheck, Replay, Statistic, replay
 from .sample import SampledFit, minus_cost_at, sample_around, with_predictive_noise
 
 STATISTICS = ("rms", "autocorrelation", "largest")
