@@ -25,7 +25,7 @@ import jaxik
 from fitting.clips import Clip, edit
 from fitting.experiment import file_tables
 from fitting.experiment.experiment import ClipEntry, Experiment
-from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiment.experiment_files import experiment_to_toml
 from fitting.experiment.file_tables import COMPLETE, Ablation
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import ClipData, load_clip_data, problem_from_clips
@@ -59,7 +59,7 @@ from .animations import Animation
 from .campaign import Campaign
 from .fit.assess import search_with_noise
 from .fit.fit import SearchRecord, record_search
-from .output import output_folder, publish
+from .output import as_experiment, output_folder, publish
 
 NUMBERS = "contribution.json"
 
@@ -661,8 +661,7 @@ def ablate(
             variant does not fit the clips; the experiment fits a capture, too; the folder cannot
             be made, or its `contribution.json` is something else.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
+    experiment = as_experiment(experiment)
     file_tables.refuse(experiment.capture, str(experiment.path), "ablate")
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)

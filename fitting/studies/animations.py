@@ -33,7 +33,6 @@ from fitting.clips.joint_maps import find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
 from fitting.ground import coverage
-from fitting.ground.coverage import Coverage
 from fitting.ground.ground_path import AS_ANIMATED, Root, RootChoice, place_root
 from fitting.ground.meshes import TerrainOptions, mesh_of
 from fitting.motion import accuracy, measures
@@ -93,22 +92,9 @@ class AnimationFiles:
         with activity.announced(f"Reading {self.clip.name}"):
             return load_flat_animation(self.clip, self.floor, self.clip_options)
 
-    def load_terrain(self) -> Terrain:
-        """The terrain of the file."""
-        return self._load_terrain(self.terrain_options)
-
-    def load_terrain_in(self, unit: float) -> Terrain:
-        """The terrain of the file in another unit, m."""
-        return self._load_terrain(replace(self.terrain_options, terrain_scale=unit))
-
-    def coverage(self, terrain: Terrain) -> Coverage:
-        """How much of it is under the feet of the clip."""
-        return coverage.measure(
-            self.flat_clip, terrain, self.terrain_options, reload=self._load_terrain
-        )
-
-    def _load_terrain(self, options: TerrainOptions) -> Terrain:
-        return options.load(self.terrain)
+    def load_terrain(self, options: TerrainOptions | None = None) -> Terrain:
+        """The terrain of the file, read by other options if any are given."""
+        return (options or self.terrain_options).load(self.terrain)
 
 
 @dataclass(frozen=True)
@@ -229,7 +215,8 @@ class Animation:
                 _, choice = place_root(self.clip, self.terrain, "ground", self.floor)
                 return self._soles(raised(self.clip, choice.rise))
             if cause.kind == "units" and self.files is not None:
-                terrain = self.files.load_terrain_in(cause.amount)
+                options = replace(self.files.terrain_options, terrain_scale=cause.amount)
+                terrain = self.files.load_terrain(options)
                 return measures.soles(self.placed_clip, self.own_speed, terrain, self.floor)
         except ValueError:  # no ground below the path, or a terrain beyond all bounds
             pass
@@ -262,7 +249,7 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     with activity.announced(f"Reading {files.clip.name} and {files.terrain.name}"):
         terrain = files.load_terrain()
         clip = files.flat_clip
-        covered = files.coverage(terrain)
+        covered = coverage.measure(clip, terrain, files.terrain_options, reload=files.load_terrain)
     if (to_fit or files.root == "ground") and covered.share < coverage.LITTLE:
         raise ValueError(covered.text())
     coverage.warn(covered)

@@ -1,9 +1,11 @@
-"""The folder of a job's results, and what the job logs."""
+"""What jobs share: reading an experiment, claiming a folder, publishing results."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fitting.experiment.experiment import Experiment
+from fitting.experiment.experiment_files import load_experiment
 from fitting.report import pages
 from fitting.report.document import Document, text
 from fitting.report.formatting import joined
@@ -11,6 +13,15 @@ from fitting.runtime import activity
 from fitting.runtime.claimed_folder import claimed
 
 from .fit import run_folder
+
+
+def as_experiment(experiment: Experiment | str | Path) -> Experiment:
+    """The experiment, read if it is the path of a file.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    return experiment if isinstance(experiment, Experiment) else load_experiment(experiment)
 
 
 @contextmanager

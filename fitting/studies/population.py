@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.experiment import file_tables, parameter_files
 from fitting.experiment.experiment import Experiment
-from fitting.experiment.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiment.experiment_files import experiment_to_toml
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import make_problem
 from fitting.experiment.systems import Preset
@@ -54,7 +54,7 @@ from .campaign import Campaign, clip_names
 from .fit import run_folder
 from .fit.assess import search_identity, search_with_noise
 from .fit.fit import SearchRecord, record_search
-from .output import output_folder, publish
+from .output import as_experiment, output_folder, publish
 
 SEARCHES = "searches"
 DRAWS = 2000  # from the hierarchy
@@ -751,8 +751,7 @@ def population(
             threshold does; it does not fit its clips; the folder cannot be made or holds something
             else.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
+    experiment = as_experiment(experiment)
     file_tables.refuse(experiment.capture, str(experiment.path), "population")
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)

@@ -17,7 +17,6 @@ from scipy import special
 
 import jaxik
 from fitting.experiment.experiment import Experiment
-from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import make_problem
 from fitting.inference.proportions import Proportion, RankTest, proportion
@@ -29,7 +28,7 @@ from fitting.report.style import AFTER, BEFORE, CAPTURED, area_key, legend, line
 from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import JsonFile
 from fitting.runtime.precision import in_float64
-from fitting.studies.output import output_folder, publish
+from fitting.studies.output import as_experiment, output_folder, publish
 
 from .replicates import (
     ADVICE,
@@ -178,8 +177,7 @@ def calibrate(
             be simulated; the folder holds another calibration; there is not one replicate; there
             is no such cluster.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
+    experiment = as_experiment(experiment)
     with output_folder(output) as folder:
         experiment = dataclasses.replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)
@@ -374,23 +372,20 @@ def _some_of(replicates: tuple[int, ...]) -> str:
 
 def checks_table(assessment: Assessment) -> Table:
     """A row for each claim about all parameters together."""
-    table = [["", "found", "share", "bounds", "wanted", "inside"]]
-    claimed = f"{FIT_LEVEL:.0%}".replace("%", " %")
-    cover = assessment.fit_coverage
-    table.append(share_row(f"the fit's {claimed} intervals contain the truth", cover, claimed))
-    for level, cover in assessment.profile_coverage.items():
-        claimed = percent(level, 0)
-        words = f"{claimed} intervals by the profiles of smooth parameters contain it"
-        table.append(share_row(words, cover, claimed))
-    for level, cover in assessment.chain_coverage.items():
-        claimed = percent(level, 0)
-        words = f"the posterior's {claimed} intervals contain the truth"
-        table.append(share_row(words, cover, claimed))
+    sentences = {
+        "the fit's {} intervals contain the truth": {FIT_LEVEL: assessment.fit_coverage},
+        "{} intervals by the profiles of smooth parameters contain it": assessment.profile_coverage,
+        "the posterior's {} intervals contain the truth": assessment.chain_coverage,
+    }
+    rows = [
+        share_row(sentence.format(percent(level, 0)), cover, percent(level, 0))
+        for sentence, covers in sentences.items()
+        for level, cover in covers.items()
+    ]
     minimum = f"{percent(IN_MINIMUM, 0)} or more"
-    table.append(share_row("fits in the right minimum", assessment.minimum, minimum))
-    back = "determined parameters came back"
-    table.append([*share_row(back, assessment.recovery, "")[:-1], ""])
-    return table
+    rows.append(share_row("fits in the right minimum", assessment.minimum, minimum))
+    rows.append([*share_row("determined parameters came back", assessment.recovery, "")[:-1], ""])
+    return [["", "found", "share", "bounds", "wanted", "inside"], *rows]
 
 
 def parameter_table(assessment: Assessment) -> Table:
@@ -404,15 +399,13 @@ def parameter_table(assessment: Assessment) -> Table:
         cover = assessment.fit_coverage_of[name]
         recovery = assessment.recovery_of[name]
         back = f"{recovery.hits} of {recovery.total}"
-        row = [name, back, f"{percent(cover.fraction, 0)} ({_bounds(cover)})", _verdict(cover)]
+        row = [name, back, f"{percent(cover.fraction, 0)} ({bounds_text(cover)})", _verdict(cover)]
         row += [percent(assessment.chain_coverage_of[name][level].fraction, 0) for level in levels]
         table.append(row)
     if assessment.ranks:
+        table.append([LOG_PROBABILITY, *([""] * (len(heading) - 2))])
         for row in table[1:]:
             row.append("yes" if assessment.ranks[row[0]].inside else "**no**")
-        for name in assessment.ranks.keys() - set(assessment.names):
-            inside = "yes" if assessment.ranks[name].inside else "**no**"
-            table.append([name, *([""] * (len(heading) - 2)), inside])
     return table
 
 
@@ -420,10 +413,11 @@ def share_row(words: str, share: Proportion, wanted: str) -> list[str]:
     """Cells of a claim: what was found, its share and bounds, what is wanted, whether it is so."""
     hits = f"{share.hits} of {share.total}"
     fraction = percent(share.fraction) if share.total else "–"
-    return [words, hits, fraction, _bounds(share), wanted, _verdict(share)]
+    return [words, hits, fraction, bounds_text(share), wanted, _verdict(share)]
 
 
-def _bounds(share: Proportion) -> str:
+def bounds_text(share: Proportion) -> str:
+    """Between which shares the probability behind a share lies."""
     return f"{percent(share.low, 0)} to {percent(share.high, 0)}"
 
 
@@ -521,9 +515,8 @@ def findings(assessment: Assessment) -> list[Finding]:
 def _intervals(assessment: Assessment) -> Finding:
     cover = assessment.fit_coverage
     motions = counted(assessment.replicates, "simulated motion")
-    bounds = f"{percent(cover.low, 0)} to {percent(cover.high, 0)}"
-    share = percent(cover.fraction, 0)
-    coverage = f"the fit's 95 % intervals contain {share} of the true values ({bounds})"
+    share = f"{percent(cover.fraction, 0)} of the true values ({bounds_text(cover)})"
+    coverage = f"the fit's 95 % intervals contain {share}"
     if not assessment.inside:
         return Finding(
             f"Of {motions}, outside their bounds: {listed(assessment.outside)}; {coverage}.",

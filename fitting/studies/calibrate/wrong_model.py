@@ -29,7 +29,6 @@ import jaxik
 from fitting.clips import contacts, edit
 from fitting.experiment import systems
 from fitting.experiment.experiment import Experiment
-from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import load_clips, problem_from_clips
 from fitting.inference import sensitivity
@@ -58,11 +57,11 @@ from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import Content
 from fitting.studies.fit.fit import Fit
-from fitting.studies.output import output_folder, publish
+from fitting.studies.output import as_experiment, output_folder, publish
 from fitting.studies.translation import NamedSystem, load_named_system
 from jaxik.world.skeleton import Transform
 
-from .calibration import NUMBERS, SUMMARY, WIDE, listed_replicates, share_row
+from .calibration import NUMBERS, SUMMARY, WIDE, bounds_text, listed_replicates, share_row
 from .replicates import (
     ADVICE,
     WRITER,
@@ -239,8 +238,7 @@ def calibrate_wrong_model(
     Raises:
         ValueError: as `calibrate`; there is no such system; no frame is held out.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
+    experiment = as_experiment(experiment)
     with output_folder(output) as folder:
         experiment = with_files(experiment, folder)
         clips = load_clips(experiment)
@@ -713,7 +711,7 @@ def findings(assessment: WrongModelAssessment) -> list[Finding]:
         )
     lines = [Finding(text, bad=not assessment.inside)]
     if true.high - true.low > WIDE:
-        bounds = f"{percent(true.low, 0)} to {percent(true.high, 0)}"
+        bounds = bounds_text(true)
         few = f"So few motions prove little: the share of true verdicts may be {bounds}."
         lines.append(Finding(few, bad=True))
     return lines

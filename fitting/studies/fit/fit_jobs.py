@@ -10,7 +10,6 @@ import numpy as np
 
 import jaxik
 from fitting.experiment.experiment import Experiment
-from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import load, remarks
 from fitting.experiment.record_files import left_out, set_aside
@@ -24,7 +23,7 @@ from fitting.report.document import Block, Grid, Section, Text
 from fitting.report.formatting import RESIDUALS, Table, joined, number
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
-from fitting.studies.output import log_output, output_folder
+from fitting.studies.output import as_experiment, log_output, output_folder
 
 from . import capture_check, fit_report, run_folder
 from .assess import assess_solution, search, search_identity, search_with_noise
@@ -56,8 +55,7 @@ def fit(
         ValueError: the experiment is wrong or does not fit its clips or its preset, or the folder
             cannot be made.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
+    experiment = as_experiment(experiment)
     with output_folder(output) as run:
         loaded = load(with_files(experiment, run))
         experiment, clips, problem, known = loaded

@@ -31,7 +31,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodF
 
 from fitting.experiment import file_tables
 from fitting.experiment.experiment import ClipEntry, Experiment
-from fitting.experiment.experiment_files import clip_to_table, experiment_to_toml, load_experiment
+from fitting.experiment.experiment_files import clip_to_table, experiment_to_toml
 from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import LoadedExperiment
 from fitting.report import pages
@@ -51,7 +51,7 @@ from fitting.studies.campaign import Campaign, clip_names
 from fitting.studies.fit import run_folder
 from fitting.studies.fit.fit import Fit, FitRecord, FittedParameter
 from fitting.studies.fit.fit_jobs import fit
-from fitting.studies.output import output_folder, publish
+from fitting.studies.output import as_experiment, output_folder, publish
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -453,9 +453,7 @@ def _loaded(
     """Experiments, read where they are paths of files."""
     if isinstance(experiments, Experiment | str | Path):
         experiments = [experiments]
-    return [
-        entry if isinstance(entry, Experiment) else load_experiment(entry) for entry in experiments
-    ]
+    return list(map(as_experiment, experiments))
 
 
 def _check_folder(folder: Path) -> None:
