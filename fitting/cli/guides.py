@@ -38,12 +38,8 @@ def parameters(options: argparse.Namespace) -> int:
     listed = guides.list_parameters(ik, options.search or "")
     if not listed:
         raise ValueError(f"no parameter of {options.preset} mentions {options.search!r}")
-    return _print_or_write(
-        options,
-        lambda width: guides.parameters_as_text(listed, width),
-        lambda: guides.parameters_as_markdown(listed),
-        lambda: guides.as_json(listed),
-    )
+    table = guides.parameter_table(listed, headings=options.format == "text")
+    return _print_or_write(options, table, lambda: guides.as_json(listed))
 
 
 @command(*FORMAT)
@@ -59,26 +55,24 @@ def schema(options: argparse.Namespace) -> int:
     from fitting.experiment.schema import experiment_schema
     from fitting.report import guides
 
-    return _print_or_write(
-        options,
-        lambda width: guides.keys_as_text(experiment_schema(), width),
-        lambda: guides.keys_as_markdown(experiment_schema()),
-        _schema_as_json,
-    )
+    return _print_or_write(options, guides.key_table(experiment_schema()), _schema_as_json)
 
 
 def _print_or_write(
-    options: argparse.Namespace,
-    as_text: Callable[[int], str],
-    as_markdown: Callable[[], str],
-    as_json: Callable[[], str],
+    options: argparse.Namespace, table: list[list[str]], as_json: Callable[[], str]
 ) -> int:
-    """Prints or writes the text of `FORMAT`; as wide as the terminal, or 100 columns in a file."""
+    """Prints or writes as `FORMAT` says; as wide as the terminal, or 100 columns in a file."""
+    from fitting.report import formatting
     from fitting.runtime import files
 
     width = 100 if options.output is not None else shutil.get_terminal_size((100, 24)).columns
-    forms = {"text": lambda: as_text(width), "markdown": as_markdown, "json": as_json}
-    text = forms[options.format]()
+    match options.format:
+        case "text":
+            text = formatting.wrapped(table, width)
+        case "markdown":
+            text = formatting.markdown(table)
+        case _:
+            text = as_json()
     if options.output is None:
         show(text)
     else:

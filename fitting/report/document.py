@@ -207,16 +207,18 @@ class Document:
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in self.numbers.items():
             write_json(folder / path, content)
-        _draw(folder, self.sections)
+        for plot in _plots(self.sections):
+            if plot.draw is not None:
+                style.save(folder / plot.name, plot.draw())
         if not self.file:
             return
-        files.write_text(folder / self.file, _whole(self))
-        pictures = _pictures(folder, self.sections)
+        files.write_text(folder / self.file, _as_markdown(self))
+        sections = [section for section in _filled(self.whole) if section.on_page]
+        pictures = pages.embed(folder, {plot.name: plot.caption for plot in _plots(sections)})
         spent = sum(picture.size for picture in pictures.values())
         clips: Sequence[Content] = ()
         if self.view is not None:
             clips = self.view.packed or motion_data.pack(self.view.clips, spent)
-        sections = _on_page(self.whole)
         html = pages.render(clips, document=self, sections=sections, pictures=pictures)
         files.write_text(folder / pages.PAGE, html)
         if stored:
@@ -301,10 +303,6 @@ def _filled(sections: Sequence[Section]) -> list[Section]:
     return [section for section in filled if section.blocks]
 
 
-def _on_page(sections: Sequence[Section]) -> list[Section]:
-    return [section for section in _filled(sections) if section.on_page]
-
-
 def blocks_of(sections: Sequence[Section]) -> Iterator[Block]:
     """The blocks of all sections that say something."""
     return (block for section in _filled(sections) for block in section.blocks)
@@ -312,18 +310,6 @@ def blocks_of(sections: Sequence[Section]) -> Iterator[Block]:
 
 def _plots(sections: Sequence[Section]) -> list[Plot]:
     return [block for block in blocks_of(sections) if isinstance(block, Plot)]
-
-
-def _draw(folder: Path, sections: Sequence[Section]) -> None:
-    for plot in _plots(sections):
-        if plot.draw is not None:
-            style.save(folder / plot.name, plot.draw())
-
-
-def _pictures(folder: Path, sections: Sequence[Section]) -> dict[str, pages.Picture]:
-    """Of the plots that the page shows, by file name."""
-    plots = _plots(_on_page(sections))
-    return pages.embed(folder, {plot.name: plot.caption for plot in plots})
 
 
 def _says_something(block: Block) -> bool:
@@ -364,7 +350,7 @@ def brief(sections: Sequence[Section]) -> JoinedText:
     return joined(parts, apart=True)
 
 
-def _whole(document: Document) -> str:
+def _as_markdown(document: Document) -> str:
     """The whole document in Markdown, but for the view."""
     others = (f"[{name}]({name}) has {words}" for name, words in document.beside.items())
     parts = [

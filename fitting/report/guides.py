@@ -1,4 +1,4 @@
-"""Every key of an experiment file, with what it may be, default and meaning, from its schema."""
+"""Lists of a system's parameters, and of the keys of experiment files, with their meaning."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from fitting.experiment import systems
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 
-from .formatting import Table, interval, markdown, wrapped
+from .formatting import Table, interval
 
 KEY_HEADING = ["key", "value", "default", "meaning"]
 WORDS = {"boolean": "true, false", "string": "text", "object": "table", "null": ""}
@@ -24,17 +24,8 @@ BY_PARAMETER = ("parameters", "free", "start")  # tables whose keys are those of
 PARAMETER_HEADING = ["parameter", "default", "range", "meaning"]
 
 
-def keys_as_text(schema: Content, width: int) -> str:
-    """The keys for a terminal with this many columns."""
-    return wrapped(_table(schema), width)
-
-
-def keys_as_markdown(schema: Content) -> str:
-    """The keys as a table in Markdown."""
-    return markdown(_table(schema))
-
-
-def _table(schema: Content) -> Table:
+def key_table(schema: Content) -> Table:
+    """The keys of a schema, a row each."""
     return [KEY_HEADING, *_rows(schema)]
 
 
@@ -137,21 +128,16 @@ def list_parameters(ik: jaxik.FootIK, word: str = "") -> list[Parameter]:
     return [parameter for parameter in parameters if parameter.mentions(word)]
 
 
-def parameters_as_text(parameters: list[Parameter], width: int) -> str:
-    """The list for a terminal with this many columns."""
+def parameter_table(parameters: list[Parameter], *, headings: bool = False) -> Table:
+    """A row for each parameter, and if wanted a row of one cell before those of each stage."""
     table: Table = [PARAMETER_HEADING]
     stage = ""
     for parameter in parameters:
-        if (own := parameter.name.partition(".")[0]) != stage:
+        if headings and (own := parameter.name.partition(".")[0]) != stage:
             stage = own
             table.append([f"{stage}: {parameter.rule}"])
-        table.append(_cells(parameter))
-    return wrapped(table, width)
-
-
-def parameters_as_markdown(parameters: list[Parameter]) -> str:
-    """The list as a table in Markdown."""
-    return markdown([PARAMETER_HEADING, *map(_cells, parameters)])
+        table.append([parameter.name, parameter.default_text, parameter.range, parameter.meaning])
+    return table
 
 
 def as_json(parameters: list[Parameter]) -> str:
@@ -160,10 +146,6 @@ def as_json(parameters: list[Parameter]) -> str:
     for row in rows:
         del row["default_text"]
     return json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False)
-
-
-def _cells(parameter: Parameter) -> list[str]:
-    return [parameter.name, parameter.default_text, parameter.range, parameter.meaning]
 
 
 def _plain(value: object) -> object:
