@@ -251,7 +251,7 @@ def test_a_hostile_file_is_refused_and_runs_no_code(file, tmp_path):
         (MAGIC + evil, "is damaged"),
         (changed(whole, evil), "is damaged"),
         (whole.replace(MAGIC, b"jaxik program 2\n", 1), "program 2"),
-        (changed(whole, output=["object", "os:_wrap_close", {}]), "os:_wrap_close is no class"),
+        (changed(whole, output=["object", "os:_wrap_close", {}]), "os:_wrap_close is not a class"),
         (changed(whole, output=["name", "os:system"]), "describes no tree"),
         (changed(whole, bytes(calls_python)), "the program calls Python"),
     ):
