@@ -1,4 +1,4 @@
-"""What a study says, once: a `Document`, which the terminal, Markdown, HTML and notebooks render.
+"""The report of a study as a `Document`, which terminal, Markdown, HTML and notebooks render.
 
 A study makes one of its result; `Document.write` draws its plots and writes it as Markdown and as
 a page, `text` gives what the terminal shows. What has nothing to say (a list without lines, a table
@@ -25,7 +25,7 @@ STORED = "report.json"
 
 
 class Text(NamedTuple):
-    """A paragraph; what is `code` or **strong** in Markdown is so."""
+    """A paragraph, in which `code` and **strong** are as in Markdown."""
 
     text: str
     brief: bool = False
@@ -59,7 +59,7 @@ class Grid(NamedTuple):
 
     rows: Table
     label: str
-    """For those who do not see it."""
+    """A description, for screen readers."""
     brief: bool = True
     """Whether a terminal shows it."""
 
@@ -82,7 +82,7 @@ class ParameterRow:
     before: float | None
     truth: float | None
     description: str
-    """Of the interval plot, for those who do not see it."""
+    """A description of the interval plot, for screen readers."""
 
 
 class Ranges(NamedTuple):
@@ -90,7 +90,7 @@ class Ranges(NamedTuple):
 
     rows: Sequence[ParameterRow]
     label: str
-    """For those who do not see it."""
+    """A description, for screen readers."""
     note: str
     """What the page draws."""
     table: Table
@@ -125,7 +125,7 @@ class Finding(NamedTuple):
 
     text: str
     bad: bool = False
-    """Whether it says what went badly."""
+    """Whether it is bad news."""
 
 
 class Section(NamedTuple):
@@ -147,7 +147,7 @@ class View:
     visible: str
     """From which depth on a sole in the ground is marked, with its unit."""
     stands: str = "animated"
-    """Whose feet are said to stand."""
+    """The motion whose stances the timeline shows."""
     watched: str = "watched motion"
     """Whose soles are marked."""
     packed: Sequence[Content] = ()
@@ -156,7 +156,7 @@ class View:
 
 @dataclass(frozen=True)
 class Document:
-    """All that a study says."""
+    """The report of a study."""
 
     file: str
     """Name of its Markdown file; empty for what has no text and no page in a folder."""
@@ -168,7 +168,7 @@ class Document:
     good: bool
     """Whether the verdict is good news."""
     findings: Sequence[Finding]
-    """Every rendering begins with those that say what went badly."""
+    """Every rendering begins with those that are bad."""
     sections: Sequence[Section]
     setup: Table
     """What was run, and how: a name and a text each."""
@@ -178,11 +178,11 @@ class Document:
     """What is in which other file beside it, by file name; `write` does not write these."""
     view: View | None = None
     note: str = ""
-    """What else there is to say of the findings."""
+    """Further remarks on the findings."""
 
     @property
     def sentences(self) -> list[str]:
-        """The findings, what went badly first."""
+        """The findings, bad ones first."""
         return [finding.text for finding in sorted(self.findings, key=lambda f: not f.bad)]
 
     @property

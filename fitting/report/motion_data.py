@@ -91,7 +91,7 @@ def pack(clips: Sequence[ViewedClip], spent: int = 0) -> list[dict[str, Any]]:
 
 
 def steps_between_frames(clips: Sequence[ViewedClip], room: int = MAX_BYTES) -> list[int]:
-    """How many frames of each clip make one on the page, for motions of so many bytes in all."""
+    """How many frames of each clip make one on the page; all motions then fit into `room` bytes."""
     frames = [len(clip.stance) for clip in clips]
     steps = [max(1, math.ceil(clip.reference.clip.fps / MAX_RATE - 0.01)) for clip in clips]
     sizes = [sum(_motion_bytes(each.motion) for each in clip.motions.values()) for clip in clips]

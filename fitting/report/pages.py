@@ -138,7 +138,7 @@ def system(experiment: Experiment) -> str:
 
 
 def loss_and_seed(experiment: Experiment) -> list[str]:
-    """A row with what else decides a fit."""
+    """A row with the loss and the seed."""
     return ["Loss and seed", f"{experiment.loss}, {experiment.seed}"]
 
 

@@ -1,4 +1,4 @@
-"""What a program is busy with and what it has found: long work says so here, and watchers listen.
+"""What a program is doing and what it has found: long work reports it here, to watchers.
 
 ```python
 with activity.announced("Drawing pictures", total=len(plots)) as work:
@@ -36,7 +36,7 @@ class Work:
     ):
         self.title = title
         self.total = total
-        """How many parts it has, or has at most; None if that cannot be said."""
+        """How many parts it has, or has at most; None if unknown."""
         self.done = done
         """Of these parts."""
         self._first: tuple[int, float] | None = None
@@ -62,7 +62,7 @@ class Work:
 
     @property
     def seconds_left(self) -> float | None:
-        """If it goes on as before; None where that is not known, and at the end."""
+        """If it goes on as before; None while unknown, and at the end."""
         each = self.seconds_each
         if self.total is None or each is None or self.done >= self.total:
             return None
@@ -125,7 +125,7 @@ class Watcher:
         """Called with a line or a table, as the command line prints it."""
 
     def reported(self, result: object) -> None:
-        """Called with a result on the way: a step of a search, a state of a chain, a new row."""
+        """Called with an intermediate result: a step of a search, a state of a chain, a new row."""
 
 
 _watchers: ContextVar[tuple[Watcher, ...]] = ContextVar("watchers", default=())
@@ -177,7 +177,7 @@ def innermost() -> Work | None:
 
 
 def note(text: str) -> None:
-    """Says in a line how the innermost work that is going on gets on."""
+    """Says in a line how far the innermost work is."""
     if (work := _innermost.get()) is not None:
         work.note = text
         work.changed()
@@ -190,7 +190,7 @@ def log(text: str) -> None:
 
 
 def report(result: object, text: str = "") -> None:
-    """Hands a result on the way to whoever watches.
+    """Hands an intermediate result to the watchers.
 
     Args:
         result: a step of a search, a state of a chain, a new row.

@@ -1,4 +1,4 @@
-"""Calls that run in other processes beside what goes on here, such as the drawing of pictures.
+"""Calls that run in other processes beside this one, such as the drawing of pictures.
 
 Threads would wait for each other, as Python runs one at a time. The processes import what the
 functions need and nothing of the program that runs, so scripts need no guard; they end by

@@ -172,7 +172,7 @@ def _cores(client: "Client") -> list[int]:
 
 
 def _environment() -> dict[str, str]:
-    """What makes workers of this machine compute, and cache programs, as this process does."""
+    """Variables with which workers of this machine compute, and cache programs, as this process."""
     names = (cache_folder.FOLDER, cache_folder.ENABLED, cache_folder.MIN_SECONDS)
     settings = {name.upper(): cache_folder.setting(name) for name in names}
     return (
@@ -219,7 +219,7 @@ def drop_programs_of_too_many() -> None:
 
 
 class Effort(TypedDict):
-    """What a piece of work took, and where it was done."""
+    """The cost of a piece of work, and where it was done."""
 
     seconds: float
     """Without those for which it waited."""
@@ -250,7 +250,7 @@ class Stopwatch:
             self._waited += time.monotonic() - began
 
     def read(self) -> Effort:
-        """What has been taken so far."""
+        """The effort so far."""
         began, cpu_began = self._began
         return {
             "seconds": time.monotonic() - began - self._waited,

@@ -178,7 +178,7 @@ def one_of(words: Iterable[Any]) -> Constraint:
 
 
 def list_of(element: Constraint, size: int | None = None) -> Constraint:
-    """A list of so many such elements, or of any number of them; those of tables are read later."""
+    """A list of `size` such elements, or of any number; those that are tables are read later."""
     length = "" if size is None else f" of {size}"
 
     def accepts(value: object) -> bool:
@@ -256,7 +256,7 @@ def _value(entry: Any, declared: Key, name: str, where: str) -> Any:
 
 
 def read(value: object, table: type[Declared], where: str) -> Declared:
-    """What a dataclass makes of a table; arguments and errors are those of `check_table`."""
+    """A table as a dataclass; arguments and errors are those of `check_table`."""
     values = check_table(value, keys(table), where)
     with error_context(where):
         return table(**values)

@@ -122,7 +122,7 @@ def sweep(folder: Path) -> None:
 def _sweep_first_release(path: Path) -> None:
     """Removes what processes of 0.1.0 have left of a file: `.NAME`, 8 characters and its suffix.
 
-    Files of other names, those that others may read and those that changed of late stay.
+    Files of other names, those that others may read and those that changed recently stay.
     """
     left = re.compile(rf"\.{re.escape(path.stem)}[a-z0-9_]{{8}}{re.escape(path.suffix)}")
     for entry in os.scandir(path.parent):

@@ -129,7 +129,7 @@ def check_version(path: Path, version: object, newest: int) -> None:
 
 
 def length(count: int) -> Constraint:
-    """Lists of so many elements."""
+    """A list of this many elements."""
     return Constraint(f"a list of {count}", lambda elements: len(elements) == count)
 
 

@@ -94,7 +94,7 @@ class Row:
 
     @property
     def message(self) -> str:
-        """Of the search."""
+        """What the search says of its end."""
         return "Nothing is free." if self.search is None else self.search["message"]
 
     @property
@@ -130,19 +130,19 @@ class Split:
     name: str
     fitted: Sequence[tuple[ClipEntry, ClipData]]
     measured: Sequence[tuple[ClipData, slice]]
-    """Clips, and the frames of them that count."""
+    """Clips, and the frames of them that are measured."""
 
 
 class Task(NamedTuple):
     """A variant that is fitted and measured on a split."""
 
     key: str
-    """As that of its row."""
+    """That of its row."""
     name: str
     """Of the variant."""
     variant: Experiment
     part: int
-    """As that of its row."""
+    """That of its row."""
     split: Split
 
     def __str__(self) -> str:
@@ -208,7 +208,7 @@ def without(experiment: Experiment, ablation: Ablation) -> Experiment:
     of its own are added.
     """
     changed = replace(experiment, rules={**experiment.rules, **ablation.rules})
-    # Names that neither system has stay, and are reported as mistakes later.
+    # Names that neither system has stay: they are reported as mistakes later.
     missing = set(leaf_names(experiment.preset_system())) - set(leaf_names(changed.preset_system()))
     fixed = {name: value for name, value in experiment.parameters.items() if name not in missing}
     free = {
@@ -340,7 +340,7 @@ def _key(variant: Experiment, split_name: str, content: str) -> str:
 
 
 def read(folder: Path | None) -> list[Row]:
-    """The rows that a folder holds; none if it has no `contribution.json`.
+    """The rows in a folder; none if it has no `contribution.json`.
 
     Raises:
         ValueError: the file is something else.
@@ -447,7 +447,7 @@ def _rise(key: str, rise: float) -> str:
 
 
 class Rise(NamedTuple):
-    """How much further ankles are from the captured ones without a rule, on parts held out."""
+    """How much further ankles are from the captured ones without a rule, on held-out parts."""
 
     variant: str
     mean: float
@@ -481,7 +481,7 @@ def document(experiment: Experiment, rows: Sequence[Row]) -> Document:
 
 
 def rises(rows: Sequence[Row]) -> list[Rise]:
-    """Of each variant, the largest first; without those of which nothing is known."""
+    """The rise of each variant whose rise is known, the largest first."""
     held_out = {(row.variant, row.part): row.agreement.ankle for row in rows if row.part}
     parts = sorted({part for _, part in held_out})
     findings = []

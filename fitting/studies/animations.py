@@ -1,4 +1,4 @@
-"""A flat animation on a terrain, and what a system makes of it.
+"""A flat animation on a terrain, and its motion by a system.
 
 How much the motion of a system depends on the frame rate at which it runs.
 
@@ -112,7 +112,7 @@ class Animation:
     carried: Float64[np.ndarray, "frames 3"] | None = None
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
     speed: float = 1.0
-    """Of the clip's root over that with which its feet step."""
+    """Speed of the clip's root, as a multiple of that with which its feet step."""
     tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Parameters that change along the clip, (frames, ...) by dotted name."""
     given_frames: jaxik.Frame | None = None
@@ -183,7 +183,7 @@ class Animation:
 
     @cached_property
     def bounds(self) -> dict[str, float]:
-        """The bounds of what is made of it, by measure; see `measures.bounds`."""
+        """The bounds of its motions, by measure; see `measures.bounds`."""
         animated = self.placed_clip
         bounds = measures.bounds(animated, self._soles(animated))
         return bounds if self.is_synthetic else {k: v for k, v in bounds.items() if k not in NOISY}
@@ -270,7 +270,7 @@ def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:
     """The captured motion of an animation, where the file of the clip has it.
 
     It may hold both motions, or a clip that follows the terrain, from which the ground was taken
-    out. At another speed neither goes where it was captured.
+    out. At another speed, neither has the captured path.
     """
     if files.speed != 1.0:
         return None
@@ -400,7 +400,7 @@ def trunk_text(result: jaxik.Result, clip: Clip) -> str:
 
 
 def arrays(motion: PlacedMotion) -> dict[str, np.ndarray]:
-    """What is written beside a solved clip: positions by role, and `placement` as JSON."""
+    """The arrays beside a solved clip in its file: positions by role, and `placement` as JSON."""
     described = np.array(json.dumps(motion.measures.numbers()))
     return positions_by_role(motion.clip) | {"placement": described}
 

@@ -94,7 +94,7 @@ class Comparison(Shown):
     causes: Mapping[str, Cause | None]
     """Why feet are off their ground, of the systems; None where they are not."""
     failures: Mapping[str, str] = field(default_factory=dict)
-    """What went wrong, of systems that gave no motion."""
+    """The errors of systems that gave no motion, by name."""
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
 
@@ -133,7 +133,7 @@ class Comparison(Shown):
         }
 
     def against(self, system: str) -> list[Bounded]:
-        """What is measured of a system beside its bounds, the worst first."""
+        """The measures of a system beside their bounds, the worst first."""
         return self.motions[system].measures.against(self.bounds)
 
     def table(self) -> "pandas.DataFrame":

@@ -190,7 +190,7 @@ class DraftRequest:
     clips: tuple[Path, ...]
     """Captured."""
     terrains: tuple[Path, ...] = ()
-    """None, one for all clips, or one for each; without, the ground is reconstructed."""
+    """None, one for all clips, or one for each; without any, the ground is reconstructed."""
     bases: tuple[Path, ...] = ()
     """Flat animations: none, or one for each clip."""
     preset: Preset = DEFAULT_PRESET
@@ -224,7 +224,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Draft:
-    """A first experiment, and what it rests on."""
+    """A first experiment, and the assumptions behind it."""
 
     experiment: Experiment
     grounds: tuple[Ground | None, ...]
@@ -297,8 +297,8 @@ def draft(
     """Chooses what to fit, and says what is assumed.
 
     Args:
-        request: what there is.
-        clips: that are loaded of it.
+        request: the files.
+        clips: of the request, loaded.
         folder: where the experiment is going to lie.
         grounds: of `reconstruct_grounds`, whose meshes are written.
 
@@ -582,7 +582,7 @@ def init(request: DraftRequest, output: str | Path) -> Experiment:
     logged.
 
     Args:
-        request: the clips, and what there is besides.
+        request: the clips, and the files that belong to them.
         output: folder for the experiment and the grounds; it may hold other files.
 
     Raises:

@@ -30,7 +30,7 @@ SCHEMA = "experiment.schema.json"  # beside a copied experiment, for editors
 
 
 class Source(NamedTuple):
-    """A system, and what a parameter file says of it besides."""
+    """A system, with its preset and the body that its numbers are for."""
 
     ik: jaxik.FootIK
     preset: Preset

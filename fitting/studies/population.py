@@ -106,11 +106,11 @@ class SearchTask(NamedTuple):
     """A search with the settings of an experiment."""
 
     name: str
-    """Of what is fitted, for the reader."""
+    """What is fitted, in words."""
     problem: Problem[jaxik.FootIK]
     experiment: Experiment
     key: str
-    """Of everything that its result follows from."""
+    """A digest of everything that its result follows from."""
 
 
 def _task(name: str, problem: Problem[jaxik.FootIK], experiment: Experiment) -> SearchTask:
@@ -161,7 +161,7 @@ def result_line(result: SearchResult) -> str:
 
 
 def search_store(folder: Path | None, size: int) -> Store[SearchResult]:
-    """The results of searches for so many parameters."""
+    """The results of searches, each of which has `size` parameters."""
 
     def check(result: SearchResult) -> None:
         if len(result["u"]) != size:
@@ -189,17 +189,17 @@ class ParameterEstimates(TypedDict):
     level: str
     """What has a value of its own: `clip` or `subject`; else it is `shared`."""
     alone: list[Estimate]
-    """Of each clip, by itself."""
+    """One for each clip, fitted by itself."""
     pooled: Estimate
-    """Of all clips together, with one value."""
+    """One value for all clips together."""
     clips: list[Estimate]
-    """Of each clip in the population."""
+    """One for each clip, in the population."""
     centre: Estimate
-    """Of the population."""
+    """The centre of the population."""
     spread: Estimate | None
-    """Standard deviation in the population, of u; None where shared."""
+    """Standard deviation of u in the population; None where shared."""
     range: list[float] | None
-    """In which another clip or subject is expected with 95 %; None where shared."""
+    """The central 95 % of further clips or subjects; None where shared."""
 
 
 @in_float64
@@ -370,7 +370,7 @@ class Population:
 
     @property
     def converged(self) -> bool:
-        """Whether all searches and the fit of the population have."""
+        """Whether all searches and the fit of the population have converged."""
         return not self.unconverged
 
     @property

@@ -1,4 +1,4 @@
-"""Runs systems through made situations, and measures what comes out against its bounds.
+"""Runs systems through made situations, and measures their motions against bounds.
 
 The bounds of `fitting.motion.measures` say what a viewer notices, and what the animation and the
 ground ask of any motion that puts the feet on the ground; none was chosen by what a system reaches.
@@ -174,7 +174,7 @@ class Situation:
     quick: bool = False
     """Whether it belongs to the short form of the suite."""
     vehicle: Vehicle | None = None
-    """What carries ground and character."""
+    """A vehicle that carries ground and character."""
 
     def animation(self, seconds: float) -> Animation:
         """The animation, with its root where the commands put it."""
@@ -278,7 +278,7 @@ def choose(only: str | None = None, *, quick: bool = False) -> Plan:
 
 @dataclass(frozen=True)
 class Scene:
-    """A situation, and what the systems made of it."""
+    """A situation, and the motions of the systems in it."""
 
     situation: Situation
     comparison: Comparison

@@ -103,7 +103,7 @@ def title_of(terrain: Reconstruction, clip: Clip) -> str:
 
 
 def document(mesh: Path, terrain: Reconstruction, clip: Clip) -> Document:
-    """What a reconstruction says, with its picture, which is drawn; arguments as for `write`."""
+    """The report of a reconstruction, whose picture is drawn already; arguments as for `write`."""
     surface = describe_surface(terrain)
     error = terrain.predictions[terrain.chosen].rms
     return Document(

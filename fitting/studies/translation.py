@@ -249,7 +249,7 @@ def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ..
 
 
 def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None) -> ClipData:
-    """What the source makes of a clip, as the reference."""
+    """The clip with its motion by the source as the reference."""
     animation = load_animation(files, to_fit=True)
     if fps is not None:
         clip = edit.resample(animation.clip, fps)
@@ -317,7 +317,7 @@ def save_source(run: Path, translation: Translation) -> None:
 
 @in_float64
 def differences(fitted: Fit) -> list[Difference]:
-    """What remains of the source's correction, for each clip."""
+    """The remaining differences from the source, for each clip."""
     return [
         accuracy.measure_difference(scene, result)
         for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
@@ -346,7 +346,7 @@ def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Diff
 
 
 def _plots(translation: Translation, count: int) -> list[Plot]:
-    """What remains of each clip, for so many of them."""
+    """A plot of what remains for each of `count` clips."""
     name = translation.experiment.name
     if count == 1:
         return [Plot("difference.png", f"{name}: what remains")]
@@ -465,7 +465,7 @@ def table(remainders: Mapping[str, Remainder], source: str) -> Table:
 
 
 def headline(remainders: Mapping[str, Remainder], source: str, target: str) -> str:
-    """How much of the source's correction the target reproduces, in one sentence."""
+    """The share of the source's correction that the target reproduces, in one sentence."""
     parts = [
         f"{percent(remainder.reproduced)} of that of the {DIFFERENCES[quantity].name}"
         for quantity, remainder in remainders.items()

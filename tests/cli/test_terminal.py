@@ -13,8 +13,7 @@ import pytest
 
 from fitting.cli import main, terminal
 from fitting.cli.terminal import PlainLines, show, watched
-from fitting.report.formatting import aligned, joined
-from fitting.report.guides import wrapped
+from fitting.report.formatting import aligned, joined, wrapped
 from fitting.runtime import activity
 from fitting.studies import exports
 from support.watching import Recorder

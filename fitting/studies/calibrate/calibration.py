@@ -76,7 +76,7 @@ RANKED = (
 )
 
 PAIRS_PER_ROW, PANELS_PER_ROW = 2, 4
-BINS = {100: 20, 0: 10}  # of a histogram, from so many replicates on
+BINS = {100: 20, 0: 10}  # of a histogram, by the least number of replicates
 BAND = "#dddddd"
 
 WIDE = 0.2  # of bounds, from which being inside them proves little
@@ -88,12 +88,12 @@ class Calibration:
 
     fits: list[ReplicateFit]
     chains: list[ReplicateChain]
-    """None, or as many as there are fits."""
+    """Empty, or one for each fit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Assessment(Judgement):
-    """All checks of a calibration, and what goes with them."""
+    """All checks of a calibration, with their numbers."""
 
     names: tuple[str, ...]
     """Of the parameters."""
@@ -104,7 +104,7 @@ class Assessment(Judgement):
     fit_coverage_of: Mapping[str, Proportion]
     """The same, by parameter."""
     profile_coverage: Mapping[float, Proportion]
-    """How often narrower intervals do, by level, that the profiles of smooth parameters give."""
+    """How often narrower intervals of smooth parameters, from their profiles, do, by level."""
     minimum: Proportion
     """How often the fit ended in the truth's minimum, or a lower one."""
     recovery: Proportion
@@ -295,7 +295,7 @@ def _chain_coverage(
 
 
 def explanation(assessment: Assessment) -> str:
-    """What was done, and what the bounds are."""
+    """The method, and what the bounds are."""
     return (
         "Truths were drawn from the prior, motion was simulated from them with the noise that the "
         "experiment assumes, and each was fitted as `jaxik fit` does. Bounds are those of the "
@@ -346,7 +346,7 @@ def document(experiment: Experiment, calibration: Calibration, assessment: Asses
 
 
 def remarks(assessment: Assessment) -> list[str]:
-    """What the tables do not say, a sentence each; nothing if there is nothing to say."""
+    """Replicates that need attention, a sentence for each kind that occurs."""
     sentences = {
         f"A fit is in the right minimum if its cost is at most {SAME_MINIMUM:g} above where a "
         f"descent from the truth ends; {percent(IN_MINIMUM, 0)} should be. Replicates in another "
@@ -410,7 +410,7 @@ def parameter_table(assessment: Assessment) -> Table:
 
 
 def share_row(words: str, share: Proportion, wanted: str) -> list[str]:
-    """Cells of a claim: what was found, its share and bounds, what is wanted, whether it is so."""
+    """Cells of a claim: count, share and bounds, the wanted share, and whether it is inside."""
     hits = f"{share.hits} of {share.total}"
     fraction = percent(share.fraction) if share.total else "–"
     return [words, hits, fraction, bounds_text(share), wanted, _verdict(share)]

@@ -85,10 +85,10 @@ class Kind(NamedTuple):
 
     folder: str
     word: str
-    """For several of it."""
+    """Its plural, for the reader."""
     file: JsonFile[Any]
     line: Callable[[Any], str]
-    """One of it, for the reader."""
+    """Describes one, for the reader."""
 
 
 def claim(
@@ -99,7 +99,7 @@ def claim(
     noise_factor: float,
     truth: Content | None = None,
 ) -> None:
-    """Writes into a folder what is calibrated there, or compares it with what is written there.
+    """Writes into a folder what is calibrated there, or compares it with what it says already.
 
     Raises:
         ValueError: there is not one replicate; the noise is not positive; the folder is that of
@@ -186,14 +186,14 @@ def _check(parameters: Sequence[str], result: Mapping[str, Any]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Judgement(ABC):
-    """What is found in replicates; some of it is checked."""
+    """Statistics of replicates, some of which are checked."""
 
     replicates: int
 
     @property
     @abstractmethod
     def checks(self) -> Mapping[str, Proportion | RankTest]:
-        """What is checked, by what is said of it where it is outside its bounds."""
+        """What is checked, by the words for it where it is outside its bounds."""
 
     @property
     def outside(self) -> list[str]:
@@ -253,7 +253,7 @@ class ReplicateFit(Replicate):
     truth_levels: list[Finite]
     """Of the smallest intervals of the profiles that contain the truth, 0..1."""
     truth_valley_cost: float
-    """Where a descent that begins at the truth ends."""
+    """The cost where a descent from the truth ends."""
 
 
 class ReplicateChain(TypedDict):

@@ -134,7 +134,7 @@ class PartDistances(TypedDict):
 
 
 class Verdict(TypedDict):
-    """What a fit says of its motion, and what it rests on."""
+    """The verdict of a fit on its motion, and the distances behind it."""
 
     fits: bool
     sentence: str
@@ -174,13 +174,13 @@ WRONG_MODEL = Kind("wrong_model", "fits", JsonFile(WrongModelFit, WRITER, ADVICE
 
 @dataclasses.dataclass(frozen=True)
 class WrongModelAssessment(Judgement):
-    """What was found, on frames that were held out unless a field says otherwise."""
+    """The results, on held-out frames unless a field says otherwise."""
 
     kept_no_worse: Proportion
     """How often the selected system is no further from the capture than the flat animation, by the
     root mean square over ankles, knees and pelvis."""
     kept_no_worse_anywhere: Proportion
-    """How often no kind of joint is, and the orientation of the feet neither."""
+    """How often no kind of joint, nor the orientation of the feet, is further off."""
     kept_no_worse_noise_free: Proportion
     """The first again, against the motion without errors."""
     fitted_no_worse: Proportion
@@ -191,7 +191,7 @@ class WrongModelAssessment(Judgement):
     """The same, by what it says."""
     coverage_of: Mapping[str, Proportion]
     """How often the fit's 95 % intervals contain the value of the system that made the motion, by
-    parameter that both have; nothing that they should."""
+    parameter that both have; nothing says that they should."""
     medians: Mapping[str, Mapping[str, float]]
     """m or rad, of the distances from the motion without errors, by motion and kind of joint."""
     worse: tuple[int, ...]
@@ -400,7 +400,7 @@ def is_true(fit: WrongModelFit) -> bool:
 
 
 def distances_of(verdict: Verdict) -> Distances:
-    """The distances as they were before a file held them."""
+    """The distances of a verdict that was read from a file."""
     return Distances(cast(Mapping[Part, Mapping[Motion, Kinds]], verdict["distances"]))
 
 
@@ -415,7 +415,7 @@ def _no_worse(distances: Distances, motion: Motion) -> bool:
 
 
 def _no_worse_anywhere(distances: Distances, motion: Motion) -> bool:
-    """Whether no kind of joint is visibly further off, and the orientation of the feet neither."""
+    """Whether no kind of joint, nor the orientation of the feet, is visibly further off."""
     motions = distances.parts["held_out"]
     return all(
         motions[motion][kind] <= motions["animation"][kind] + UNSEEN[kind] for kind in UNSEEN
@@ -423,7 +423,7 @@ def _no_worse_anywhere(distances: Distances, motion: Motion) -> bool:
 
 
 def _is_far(distances: Distances, margin: float) -> bool:
-    """Whether the fitted motion is off by more than looks the same, and so many `UNSEEN`."""
+    """Whether the fitted motion is off by more than looks the same plus `margin` times `UNSEEN`."""
     return any(
         motions["fitted"][kind] > CLOSE[kind] + margin * UNSEEN[kind]
         for motions in distances.parts.values()
@@ -584,7 +584,7 @@ def _displaced(joint: Transform, shift: Series, turn: Float[np.ndarray, "*joints
 
 
 def explanation(truth: str) -> str:
-    """What was done, and what the words mean."""
+    """The method, and what the words mean."""
     unseen = ", ".join(f"{NAMES[kind]} {size(kind, value)}" for kind, value in UNSEEN.items())
     return (
         f"Systems were drawn around `{truth}`, and their motion was captured with errors: a drift "
@@ -640,7 +640,7 @@ def coverage_table(assessment: WrongModelAssessment) -> Table:
 
 
 def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> list[str]:
-    """What the tables do not say, a sentence each; nothing if there is nothing to say."""
+    """Replicates that need attention, and what each false verdict says."""
     sentences = {
         "The selected system is worse than the animation in replicates": assessment.worse,
         "The verdict is not true in replicates": assessment.false,
@@ -695,7 +695,7 @@ def document(
 
 
 def findings(assessment: WrongModelAssessment) -> list[Finding]:
-    """What was found, and whether there are too few motions for it."""
+    """The results, and whether there are too few motions for them."""
     selected, true = assessment.kept_no_worse, assessment.verdicts
     motions = f"{counted(assessment.replicates, 'motion')} of another system"
     shares = (

@@ -1,4 +1,4 @@
-"""What clips can and cannot tell of foot IK, and how good their data are: said before any solving.
+"""What clips can and cannot tell of foot IK, and how good their data are, before any solving.
 
 NumPy on the clips as they are loaded; nothing is compiled. Lengths are for an adult.
 """
@@ -63,7 +63,7 @@ class Stances(NamedTuple):
 
 @dataclass(frozen=True)
 class CaptureCheck:
-    """What there is to say of the clips of an experiment."""
+    """Remarks on the clips of an experiment."""
 
     lines: tuple[str, ...]
     """A sentence each."""
@@ -216,7 +216,7 @@ def _tilts(heights: np.ndarray, where: np.ndarray) -> Float64[np.ndarray, "2"]:
 
 
 class CaptureSigns(NamedTuple):
-    """What one clip shows."""
+    """Signs of an offset or a lag in one clip."""
 
     ground: GroundOffset
     """Of the captured soles from the ground, as its file has it."""
@@ -225,7 +225,7 @@ class CaptureSigns(NamedTuple):
 
 
 def find(clips: Sequence[ClipData], playbacks: Sequence[Playback]) -> list[CaptureSigns]:
-    """The signs of each clip, with whole skeletons; without these nothing is looked for."""
+    """The signs of each clip that has a whole skeleton."""
     return [
         CaptureSigns(_of_ground(clip), measure_lag(play))
         for clip, play in zip(clips, playbacks, strict=False)

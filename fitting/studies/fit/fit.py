@@ -1,4 +1,4 @@
-"""One fit: the search, what it found, and its numbers as `fit.json` holds them."""
+"""One fit: the result of its search, and its numbers as `fit.json` holds them."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -58,22 +58,22 @@ class GroupSummary(TypedDict):
     count: int
     """Active residuals."""
     degrees: float
-    """Of freedom of the reduced chi-square, after correlation and fitted parameters."""
+    """Degrees of freedom of the reduced chi-square, after correlation and fitted parameters."""
     chi_square: float
     """Reduced."""
     p: float | None
     sigma: float
-    """That was given."""
+    """The assumed one."""
     noise: float
     """The sigma that the residuals imply."""
     correlation: float
-    """From frame to frame, that was given."""
+    """The assumed one, from frame to frame."""
     correlation_found: float
     correlation_left: float
     correlation_left_p: float | None
     """Of the Ljung-Box test."""
     independent_every: float
-    """s, that would be right beside the given correlation."""
+    """s, that would be right with the assumed correlation."""
     swing_ratio: float | None
     """Size in swing over size in stance."""
     swing_p: float | None
@@ -171,10 +171,10 @@ class FittedMinimum(TypedDict):
     value: Finite
     """Where it is lowest."""
     rise: Finite
-    """There, above the lowest of all."""
+    """Its cost above the lowest of all minima."""
     interval: Interval
     values: NotRequired[list[Finite]]
-    """Of all parameters there; fits by earlier versions lack them."""
+    """All parameters there; fits by earlier versions lack them."""
 
 
 class FittedParameter(TypedDict):
@@ -182,12 +182,12 @@ class FittedParameter(TypedDict):
 
     name: str
     of: NotRequired[Literal["system", "capture"]]
-    """What it belongs to; fits by earlier versions know systems only."""
+    """What it belongs to; fits by earlier versions lack it."""
     kind: Literal["smooth", "threshold"]
     unit: str
     u: U
     start_sd: StartSd
-    """Of u, where walkers start."""
+    """Width of the ball in which walkers start, in u."""
     value: Finite
     before: float
     """The value before the fit."""
@@ -211,7 +211,7 @@ class FittedParameter(TypedDict):
 
 
 class SearchRecord(TypedDict):
-    """What a search has found, as the files of all studies hold it."""
+    """The result of a search, as the files of all studies hold it."""
 
     converged: bool
     message: str
@@ -273,7 +273,7 @@ class Fit(Shown):
     solution: Solution
     identifiability: Identifiability
     known_values: Mapping[str, float] | None = None
-    """What made a synthetic reference."""
+    """Parameters that made a synthetic reference, by name."""
     run: Path | None = None
     """The folder where it is written."""
     has_noise: bool = True
@@ -294,12 +294,12 @@ class Fit(Shown):
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
-        """The clips of the problem, as the fitted capture takes them where one is fitted."""
+        """The clips of the problem, with the fitted parameters of the capture if there are any."""
         return self._fitted[1]
 
     @cached_property
     def results(self) -> tuple[jaxik.Result, ...]:
-        """What the fitted system makes of each clip."""
+        """The motion of each clip by the fitted system."""
         with activity.announced("Playing the clips with the fitted system"):
             return playback.run_all(self.ik, self.scenes)
 
@@ -338,7 +338,7 @@ class Fit(Shown):
 
     @cached_property
     def before(self) -> tuple[jaxik.Result, ...]:
-        """What the system as it was before the fit makes of each clip."""
+        """The motion of each clip by the system before the fit."""
         with activity.announced("Playing the clips with the system before the fit"):
             return playback.run_all(*self._before)
 
@@ -377,7 +377,7 @@ class Fit(Shown):
 
     @cached_property
     def capture_signs(self) -> list[CaptureSigns]:
-        """What each clip shows of a capture that is not as it seems."""
+        """Signs of an offset or a lag in the capture of each clip."""
         return capture_check.find(self.clips, self.playbacks) if self.has_noise else []
 
     @property
@@ -429,7 +429,7 @@ class Fit(Shown):
 
     @property
     def search(self) -> SearchRecord:
-        """What its search has found."""
+        """The record of its search."""
         return record_search(self.experiment, self.problem, self.solution)
 
 

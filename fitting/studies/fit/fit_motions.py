@@ -110,7 +110,7 @@ class WarmUp(activity.Watcher):
         _ = self._future
 
     def results(self) -> tuple[jaxik.Result, ...]:
-        """What the system before the fit makes of each clip; waits until it is played."""
+        """The motion of each clip by the system before the fit; waits until it is played."""
         return self._future.result()
 
     @cached_property

@@ -217,7 +217,7 @@ def goodness_blocks(fitted: Fit) -> list[Block]:
 
 
 def _describe_sizes(fitted: Fit) -> str:
-    """What the table of sizes says, and how it was made."""
+    """How the table of sizes is made and read."""
     squares = "mean of the squared residuals"
     if (loss := fitted.assumed.loss) != "squares":
         squares = f"square of the residuals' median size, before the loss `{loss}`,"
@@ -239,11 +239,11 @@ def _describe_sizes(fitted: Fit) -> str:
 
 
 def size_table(groups: Sequence[Group], *, judged: bool = True) -> Table:
-    """How large the residuals are, and with how many they are judged.
+    """The sizes of the residuals, their count and degrees of freedom.
 
     Args:
         groups: the rows.
-        judged: False leaves out p, which says nothing where sigmas are not those of the noise.
+        judged: whether to show p, which means nothing where sigmas are not those of the noise.
     """
     heading = ["residuals", "active", "degrees of freedom", "reduced chi-square", "p"]
     table = [[*heading, "sigma", "noise", "noise / sigma"]]
@@ -266,7 +266,7 @@ def distance_table(distances: Distances) -> Table:
 
 
 def distances_of_preset(distances: Distances) -> Table:
-    """How far a system that nobody has fitted yet leaves the captured motion."""
+    """How far a system before any fit is from the captured motion."""
     table = [["distance from the capture, rms", "flat animation", "preset"]]
     motions = distances.parts.get("fitted", {})
     for kind in CLOSE if motions else ():
@@ -276,7 +276,7 @@ def distances_of_preset(distances: Distances) -> Table:
 
 
 def tolerance_table(groups: Sequence[Group]) -> Table:
-    """How large the errors are where there is no noise."""
+    """The sizes of the errors where there is no noise."""
     table = [["residuals", "active", "tolerance", "error, rms", "error / tolerance"]]
     for group in groups:
         table.append([RESIDUALS[group.kind].name, str(group.plain.count), *_sizes(group)])
@@ -322,7 +322,7 @@ def _p(value: float, group: Group) -> str:
 
 
 def noise_blocks(fitted: Fit) -> list[Block]:
-    """What was estimated of the noise; nothing if nothing was."""
+    """The noise that was estimated; nothing if none was."""
     options = fitted.experiment.noise
     if not options.estimates_any:
         return []
@@ -385,7 +385,7 @@ def sentences(fitted: Fit) -> list[str]:
 
 
 def _of_clip(signs: CaptureSigns) -> list[tuple[str, str]]:
-    """What one clip shows: the key of [capture] that fits it, and a sentence."""
+    """The signs of one clip: the key of [capture] that fits each, and a sentence."""
     ground, rows = signs.ground, []
     if ground.height:
         side = "over" if ground.height > 0 else "in"

@@ -213,7 +213,7 @@ class _Calls:
         return math.ceil(wanted / devices) * devices
 
     def _bytes_each(self) -> float:
-        """What a system on a clip takes while it is computed."""
+        """Bytes that a system on a clip takes while it is computed."""
         system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
         shapes = jax.tree.leaves(jax.eval_shape(run_scene, system, scene))
         return WORKSPACE * sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
@@ -227,7 +227,7 @@ def _along(
     ik: jaxik.FootIK,
     scene: Scene,
 ) -> dict[str, Array]:
-    """What systems make of a clip, or a system of clips, shared out among devices.
+    """The measures of systems on a clip, or of a system on clips, shared out among devices.
 
     `stacked` says which arrays of system and clip have an axis of the batch; None for none.
     """

@@ -184,7 +184,7 @@ def _stem(experiment: Experiment) -> str:
 
 
 def _file_name(text: str) -> str:
-    """A name as a folder may have it on any system."""
+    """A name that a folder may have on any system."""
     return re.sub(r"[^\w.-]+", "_", text).strip("._")[:80] or "unnamed"
 
 
@@ -212,7 +212,7 @@ def _digest_of_state(path: Path, size: int, changed: int) -> str:
 
 
 class Row(TypedDict):
-    """A fit that was tried."""
+    """A fit, finished or failed."""
 
     experiment: str
     clip: str
@@ -576,7 +576,7 @@ def _check_shared_folder(folder: Path) -> None:
 
 
 def plan_line(experiments: int, tasks: int, missing: int, seeds: int) -> str:
-    """What is about to be done."""
+    """The plan, in a line."""
     of = counted(experiments, "experiment")
     seed = f", {seeds} seeds for each clip" if seeds > 1 else ""
     left = "" if missing == tasks else f"; {tasks - missing} are there already"
@@ -605,7 +605,7 @@ def parameter_table(fits: ManyFits) -> Table:
 
 
 def _quantiles(values: Sequence[float]) -> list[float]:
-    """The median, and where the middle 80 % end; nothing of nothing."""
+    """The median and the ends of the middle 80 %; empty without values."""
     if not values:
         return []
     if len(values) == 1:
@@ -648,7 +648,7 @@ def share_by_error(fits: ManyFits) -> list[str]:
 
 
 def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> Document:
-    """What many fits say; `tables` are the files that have a row for each."""
+    """The report of many fits; `tables` are the files that have a row for each."""
     title = (
         "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
         "grey where it does not; and how long fits took, on a logarithmic axis"
@@ -684,7 +684,7 @@ def document(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence
 
 @styled
 def overview(fits: ManyFits, title: str) -> Figure:
-    """Of each parameter the values of all fits; and the seconds that they took."""
+    """The values of each parameter in all fits, and the seconds that they took."""
     series = list(_by_parameter(fits).items())[:DRAWN]
     figure, grid = panels(len(series) + 1, COLUMNS, title, 3.6, 1.0)
     for axes, ((experiment, name), values) in zip(grid, series, strict=False):
@@ -695,7 +695,7 @@ def overview(fits: ManyFits, title: str) -> Figure:
 
 
 def _by_parameter(fits: ManyFits) -> dict[tuple[str, str], list[FittedParameter]]:
-    """What fits say of each parameter of each experiment."""
+    """The fitted parameters of all fits, by experiment and name."""
     series: dict[tuple[str, str], list[FittedParameter]] = {}
     for row in fits.finished:
         for fitted in row["fit"]["parameters"] if "fit" in row else ():

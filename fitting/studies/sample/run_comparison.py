@@ -159,7 +159,7 @@ def undecided(runs: Sequence[ComparedRun]) -> list[ComparedRun]:
 
 
 def findings(runs: Sequence[ComparedRun]) -> list[Finding]:
-    """Whether the figures are reliable, who is best and by how much, and who is last."""
+    """Whether the figures are reliable, which run is best and by how much, and which is last."""
     best, second, last = runs[0], runs[1], runs[-1]
     reliable = Finding("All blocks are predicted reliably from the others.")
     if shaky := [f"`{run.name}` ({run.unreliable})" for run in runs if run.unreliable]:

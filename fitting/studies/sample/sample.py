@@ -1,4 +1,4 @@
-"""Sampling the posterior around a fit, and what it makes of the prior."""
+"""Sampling the posterior around a fit, and the sensitivity of it to the prior."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -147,7 +147,7 @@ def with_predictive_noise(
 def with_open_noise(
     problem: Problem[jaxik.FootIK], experiment: Experiment
 ) -> Problem[jaxik.FootIK]:
-    """The problem with sigmas that the experiment estimates left open, as far as they can be."""
+    """The problem with estimated sigmas left open, where the loss allows it."""
     if experiment.noise.sigmas == "estimated" and problem.loss == "squares":
         return with_unknown_sigmas(problem)
     return problem

@@ -1,4 +1,4 @@
-"""The job of a sampling, and what it leaves in the folder of its run."""
+"""The job of a sampling, and the files that it writes into the folder of its run."""
 
 import math
 from dataclasses import replace
@@ -141,7 +141,7 @@ def _adopt_lower_point(
 
 @activity.announced("Writing the posterior")
 def save_posterior(run: Path, sampled: SampledFit) -> None:
-    """Writes the summary of a posterior, and of what it makes of the prior, beside its chain."""
+    """Writes the summary of a posterior beside its chain."""
     posterior = sampled.posterior
     of_prior = {
         name: {"prior": prior, "prior_sensitivity": sampled.prior_sensitivity[name]}
@@ -171,7 +171,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "seconds": posterior.seconds,
         "lower_point": lower if sampled.has_lower_point else None,
         "disagreements": sampled.disagreements,
-        **_summarise_replay(sampled.replay, sampled.left_out),
+        **summarise_replay(sampled.replay, sampled.left_out),
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
         "sigmas": {
             kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
@@ -189,7 +189,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         )
 
 
-def _summarise_replay(played: Replay | None, left_out: LeaveOneOut | None) -> Content:
+def summarise_replay(played: Replay | None, left_out: LeaveOneOut | None) -> Content:
     """Predictive checks and leave-one-out; None where there are none."""
     if played is None:
         return {"predictive_checks": None, "leave_one_out": None}
