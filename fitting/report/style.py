@@ -1,6 +1,7 @@
 """What all figures share: colours, fonts, ground, time axes, and saving to a file."""
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +128,18 @@ def shade(axes: Axes, time: np.ndarray, mask: np.ndarray, color: str, alpha: flo
     for start, end in edges.reshape(-1, 2):
         ends = float(time[start]) - half, float(time[end - 1]) + half
         axes.axvspan(*ends, color=color, alpha=alpha, linewidth=0, zorder=0)
+
+
+def name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Names the rows of the axes, which are at 0, 1, ... from the top."""
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0)
+
+
+def write_beside(axes: Axes, text: str, end: float, row: float, points: float) -> None:
+    """Writes a text some points to the right of the end of a bar."""
+    axes.annotate(text, (end, row), xytext=(points, 0), textcoords="offset points", va="center")
 
 
 def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:

@@ -33,7 +33,7 @@ from fitting.experiment.systems import leaf_names
 from fitting.ground.ground_path import place_root
 from fitting.inference.sample.blocks import SamplerSettings
 from fitting.motion.accuracy import ACCURACY, Accuracy, Errors, clip_errors, summarise
-from fitting.report import pages
+from fitting.report import pages, style
 from fitting.report.document import (
     Block,
     Document,
@@ -47,7 +47,7 @@ from fitting.report.document import (
     Text,
 )
 from fitting.report.formatting import Table, listed, meanings, number, transposed
-from fitting.report.style import AFTER, CAPTURED, STAGES, area_key, legend, line_key, panels, styled
+from fitting.report.style import AFTER, CAPTURED, STAGES
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
@@ -593,20 +593,20 @@ def variant_name(variant: str) -> str:
     return variant if variant == COMPLETE else f"without {variant}"
 
 
-@styled
+@style.styled
 def overview(rows: Sequence[Row], title: str) -> Figure:
     """Each figure of all variants: on parts held out, and where everything was fitted."""
     variants = list(dict.fromkeys(row.variant for row in rows))
     height = 0.45 * len(variants) + 1.2
-    figure, grid = panels(len(ACCURACY), PANELS_PER_ROW, title, height, 1.8, sharey=True)
+    figure, grid = style.panels(len(ACCURACY), PANELS_PER_ROW, title, height, 1.8, sharey=True)
     for axes, key in zip(grid, ACCURACY, strict=True):
         _bars(axes, key, rows, variants)
-    legend(
+    style.legend(
         figure,
-        area_key(f"{COMPLETE}: mean of the parts held out", AFTER),
-        area_key("without this rule: mean of the parts held out", ABLATED),
-        line_key("each part held out", marker="o", linestyle=""),
-        line_key("fitted on everything", CAPTURED, marker="D", linestyle=""),
+        style.area_key(f"{COMPLETE}: mean of the parts held out", AFTER),
+        style.area_key("without this rule: mean of the parts held out", ABLATED),
+        style.line_key("each part held out", marker="o", linestyle=""),
+        style.line_key("fitted on everything", CAPTURED, marker="D", linestyle=""),
     )
     return figure
 
@@ -627,17 +627,12 @@ def _bars(axes: Axes, key: str, rows: Sequence[Row], variants: Sequence[str]) ->
         parts = len(held_out)
         axes.plot(values[:parts], [place] * parts, "o", color="black", markersize=5)
         axes.plot(values[parts:], [place], "D", color=CAPTURED, markersize=6)
-        axes.annotate(
-            column.format(mean), (end, place), xytext=(8, 0),
-            textcoords="offset points", va="center",
-        )  # fmt: skip
+        style.write_beside(axes, column.format(mean), end, place, 8)
         if variant == COMPLETE and not np.isnan(mean):
             axes.axvline(column.factor * mean, color=AFTER, linestyle="--", linewidth=1.2)
     axes.locator_params(axis="x", nbins=4)
     axes.set_xlim(0.0, 1.3 * max(largest, 10.0 ** (1 - column.digits)))
-    axes.set_ylim(len(variants) - 0.4, -0.6)
-    axes.set_yticks(range(len(variants)), [variant_name(variant) for variant in variants])
-    axes.tick_params(axis="y", length=0)
+    style.name_rows(axes, list(map(variant_name, variants)))
     axes.grid(False, axis="y")
     axes.set_title(column.title.capitalize())
 

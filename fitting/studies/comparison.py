@@ -407,20 +407,12 @@ def _bars(
     rows = np.arange(len(values))
     axes.barh(rows, widths, color=[styles[name]["color"] for name in measures], height=0.7)
     for row, width, value in zip(rows, widths, values, strict=True):
-        axes.annotate(
-            MEASURES[key].format(value),
-            (width, row),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-        )
+        style.write_beside(axes, MEASURES[key].format(value), width, row, 4)
     smallest = 10.0 ** (1 - MEASURES[key].digits)  # on whose axis what rounds to 0 looks like 0
     axes.set_xlim(0.0, 1.35 * max(*widths, smallest))
     axes.xaxis.set_visible(False)  # the values are at the bars
     axes.spines["bottom"].set_visible(False)
-    axes.set_ylim(len(values) - 0.4, -0.6)
-    axes.set_yticks(rows, list(measures))
-    axes.tick_params(axis="y", length=0)
+    style.name_rows(axes, list(measures))
     axes.grid(False)
     axes.set_title(MEASURES[key].title.capitalize())
 

@@ -610,8 +610,7 @@ def overview(population: Population, title: str) -> Figure:
         _estimates(axes, row)
     _errors(grid[-1], population)
     for axes in grid[::columns]:
-        axes.set_yticks(range(len(labels)), labels)
-    grid[0].set_ylim(len(labels) - 0.4, -0.6)
+        style.name_rows(axes, labels)
     style.legend(
         figure,
         style.line_key("fitted alone, 95 %", BEFORE, marker="o"),
