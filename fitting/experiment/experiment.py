@@ -30,7 +30,7 @@ from fitting.problem.space import (
 )
 from fitting.runtime import validation
 from fitting.runtime.declarations import NEEDED, TABLE, Key, key, keys, number
-from fitting.runtime.display import Shown
+from fitting.runtime.display import Displayable
 from fitting.runtime.precision import with_floats
 from jaxik.world import body
 from jaxik.world.terrain import Terrain
@@ -132,7 +132,7 @@ FIT_KEYS = {
 
 
 @dataclass(frozen=True)
-class Experiment(Shown):
+class Experiment(Displayable):
     """Parameters of a system, and the clips to which they are fitted.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Rows of results as pandas tables, for those who go on with them there.
+"""Results in notebooks: as HTML, and as tables of pandas.
 
 pandas is optional; `pip install "jaxik[tables]"` brings it.
 """
@@ -39,7 +39,7 @@ def html(result: object) -> str:
     return f"<pre>{escaping.escape(repr(result))}</pre>"
 
 
-class Shown:
+class Displayable:
     """A result that notebooks show as tables and pictures."""
 
     def _repr_html_(self) -> str:

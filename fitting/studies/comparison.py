@@ -47,7 +47,7 @@ from fitting.report.formatting import Table, figures_table, listed, meanings, pe
 from fitting.report.motion_data import MAX_RATE, Appearance, ViewedClip, ViewedMotion
 from fitting.report.style import BEFORE, CAPTURED, STAGES
 from fitting.runtime import activity
-from fitting.runtime.display import Shown, data_frame
+from fitting.runtime.display import Displayable, data_frame
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 
@@ -84,7 +84,7 @@ BOUND, MISS = "bound", "!"  # a row of tables, and the mark of what is beyond it
 
 
 @dataclass(frozen=True)
-class Comparison(Shown):
+class Comparison(Displayable):
     """One clip under several systems, by name; the animation itself comes first."""
 
     title: str

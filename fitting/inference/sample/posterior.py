@@ -15,7 +15,7 @@ from fitting.inference.sharding import over_devices
 from fitting.problem.problem import Problem, digest
 from fitting.problem.space import Space
 from fitting.runtime import activity
-from fitting.runtime.display import Shown, data_frame
+from fitting.runtime.display import Displayable, data_frame
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
@@ -68,7 +68,7 @@ class WalkerStart:
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior(Shown):
+class Posterior(Displayable):
     """A sampled posterior. `steps` counts stored steps, each `thin_by` steps of the sampler."""
 
     names: tuple[str, ...]

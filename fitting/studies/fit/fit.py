@@ -25,7 +25,7 @@ from fitting.problem.scene import WHITENED, Scene
 from fitting.problem.space import Space, gain_readings
 from fitting.runtime import activity
 from fitting.runtime.declarations import number
-from fitting.runtime.display import Shown, data_frame
+from fitting.runtime.display import Displayable, data_frame
 from fitting.runtime.json_files import Finite, length
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
@@ -265,7 +265,7 @@ class FitRecord(SearchRecord):
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit(Shown):
+class Fit(Displayable):
     """A fitted experiment."""
 
     experiment: Experiment
