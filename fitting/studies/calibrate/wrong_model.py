@@ -33,6 +33,7 @@ from fitting.experiment.in_memory import with_files
 from fitting.experiment.problems import load_clips, problem_from_clips
 from fitting.inference import sensitivity
 from fitting.inference.proportions import Proportion, proportion
+from fitting.motion import goodness
 from fitting.motion.goodness import (
     CLOSE,
     NAMES,
@@ -56,7 +57,7 @@ from fitting.runtime import activity, cluster
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import Content
-from fitting.studies.fit.fit import Fit
+from fitting.studies.fit.fit import plain_parts
 from fitting.studies.output import as_experiment, output_folder, publish
 from fitting.studies.translation import NamedSystem, load_named_system
 from jaxik.world.skeleton import Transform
@@ -313,38 +314,15 @@ def fit_wrong_model(
         "parameters": fitted.parameters,
         "truth_values": values,
         "errors": dataclasses.asdict(sizes),
-        "captured": _judged(fitted),
-        "lasting": _judged(_against(fitted, lasting)),
-        "noise_free": _judged(_against(fitted, exact)),
+        "captured": _stored(fitted.verdict, fitted.distances),
+        "lasting": _stored(*fitted.against([scene.reference for scene in lasting.data])),
+        "noise_free": _stored(*fitted.against([scene.reference for scene in exact.data])),
     }
 
 
-def _against(fitted: Fit, other: Problem[jaxik.FootIK]) -> Fit:
-    """A fit as it is judged by other references, on the frames that were seen in its own."""
-    references = [
-        dataclasses.replace(
-            scene.reference,
-            observed=seen.reference.observed,
-            held_out=seen.reference.held_out,
-        )
-        for scene, seen in zip(other.data, fitted.problem.data, strict=True)
-    ]
-    problem = eqx.tree_at(
-        lambda problem: [scene.reference for scene in problem.data], fitted.problem, references
-    )
-    return dataclasses.replace(fitted, problem=problem)
-
-
-def _judged(fitted: Fit) -> Verdict:
-    parts = {
-        part: {motion: dict(kinds) for motion, kinds in motions.items()}
-        for part, motions in fitted.distances.parts.items()
-    }
-    return {
-        "fits": fitted.verdict.fits,
-        "sentence": fitted.verdict.sentence,
-        "distances": cast(PartDistances, parts),
-    }
+def _stored(verdict: goodness.Verdict, distances: Distances) -> Verdict:
+    parts = cast(PartDistances, plain_parts(distances))
+    return {"fits": verdict.fits, "sentence": verdict.sentence, "distances": parts}
 
 
 def identity_of(truth: NamedSystem) -> Content:

@@ -1,11 +1,12 @@
 """One fit: the result of its search, and its numbers as `fit.json` holds them."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NotRequired, TypeAlias, TypedDict
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -21,7 +22,7 @@ from fitting.motion.goodness import Assumed, Distances, Group, Verdict, describe
 from fitting.motion.playback import Playback
 from fitting.problem.capture_system import is_of_capture, system_and_scenes
 from fitting.problem.problem import Problem
-from fitting.problem.scene import WHITENED, Scene
+from fitting.problem.scene import WHITENED, Reference, Scene
 from fitting.problem.space import Space, gain_readings
 from fitting.runtime import activity
 from fitting.runtime.declarations import number
@@ -103,14 +104,18 @@ class DistancesSummary(TypedDict):
     """Whose parameters are in `parameters.toml`: fitted, or before."""
 
 
-def summarise_distances(distances: Distances) -> DistancesSummary:
-    """The distances, and what follows from them."""
-    parts = {
+def plain_parts(distances: Distances) -> dict[str, dict[str, dict[str, float]]]:
+    """The distances as JSON holds them: by part, motion and kind."""
+    return {
         part: {motion: dict(kinds) for motion, kinds in motions.items()}
         for part, motions in distances.parts.items()
     }
+
+
+def summarise_distances(distances: Distances) -> DistancesSummary:
+    """The distances, and what follows from them."""
     setbacks = [describe_setback(setback) for setback in distances.setbacks]
-    return {**parts, "setbacks": setbacks, "kept": distances.better}  # type: ignore[typeddict-item]
+    return {**plain_parts(distances), "setbacks": setbacks, "kept": distances.better}  # type: ignore[typeddict-item]
 
 
 def _summarise_group(group: Group) -> GroupSummary:
@@ -330,11 +335,14 @@ class Fit(Displayable):
     @cached_property
     def groups(self) -> list[Group]:
         """The residuals of each kind in each clip."""
+        return self._groups(self.playbacks)
+
+    def _groups(self, playbacks: Sequence[Playback]) -> list[Group]:
         correlations = [
             {kind: float(scene.sigmas.correlation_of(kind)) for kind in WHITENED}
             for scene in self.problem.data
         ]
-        return goodness.measure_groups(self.playbacks, correlations, self.assumed)
+        return goodness.measure_groups(playbacks, correlations, self.assumed)
 
     @cached_property
     def before(self) -> tuple[jaxik.Result, ...]:
@@ -369,6 +377,13 @@ class Fit(Displayable):
         if self.has_noise:
             return goodness.judge(self.groups, self.assumed, self.distances)
         return goodness.judge_tolerances(self.groups)
+
+    def against(self, references: Sequence[Reference]) -> tuple[Verdict, Distances]:
+        """The verdict and the distances beside other references, on the frames of its own."""
+        before = _play_beside(references, self._before[1], self.before)
+        after = _play_beside(references, self.scenes, self.results)
+        distances = goodness.measure_distances(before, after)
+        return goodness.judge(self._groups(after), self.assumed, distances), distances
 
     @property
     def is_worse(self) -> bool:
@@ -431,6 +446,19 @@ class Fit(Displayable):
     def search(self) -> SearchRecord:
         """The record of its search."""
         return record_search(self.experiment, self.problem, self.solution)
+
+
+def _play_beside(
+    references: Sequence[Reference], scenes: Sequence[Scene], results: Sequence[jaxik.Result]
+) -> tuple[Playback, ...]:
+    """Clips beside other references, of which the same frames count."""
+    playbacks = []
+    for reference, scene, result in zip(references, scenes, results, strict=True):
+        own = scene.reference
+        beside = dataclasses.replace(reference, observed=own.observed, held_out=own.held_out)
+        scene = eqx.tree_at(lambda scene: scene.reference, scene, beside)
+        playbacks.append(playback.play(scene, result))
+    return tuple(playbacks)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
