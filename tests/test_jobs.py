@@ -80,7 +80,7 @@ SAMPLE_WORK = [
     ("Writing the posterior",),
     (
         "Drawing the posterior",
-        (posterior_report.posterior_plots, "corner"),
+        (posterior_report, "corner"),
         (document.Document, "write"),
     ),
 ]

@@ -18,7 +18,7 @@ from jaxik.maths import parameter_tree
 from .comparison import Comparison, document
 from .fit import fit_plots, fit_tables
 from .fit.fit import Fit
-from .sample import posterior_plots, posterior_report
+from .sample import posterior_report
 
 LEFT = Markup(' style="text-align: left"')
 PICTURE = Markup('<img style="max-width: 100%" alt="{}" src="data:image/png;base64,{}">')
@@ -122,7 +122,7 @@ def fit_html(fitted: Fit) -> str:
 def posterior_html(posterior: Posterior) -> str:
     """How the sampling went, the parameters with their intervals, and the corner plot."""
     title = "posterior of the parameters"
-    figure = posterior_plots.corner(posterior, posterior.names, {}, None, title)
+    figure = posterior_report.corner(posterior, posterior.names, {}, None, title)
     return page(
         "Posterior",
         sentences([posterior.message]),

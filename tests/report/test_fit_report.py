@@ -38,7 +38,7 @@ from fitting.runtime import display
 from fitting.studies.fit import fit_report, fit_tables, run_folder
 from fitting.studies.fit.capture_check import CaptureSigns, GroundOffset
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import posterior_plots, posterior_report, sample_jobs
+from fitting.studies.sample import posterior_report, sample_jobs
 from fitting.studies.sample.sample import SampledFit
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
@@ -472,12 +472,12 @@ def first_coordinates(axes) -> tuple[set[float], set[float]]:
 
 def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters_or_in_the_only_one():
     values, known = {"foot.share": 0.61, "foot.idle": 0.5}, {"foot.idle": 0.4}
-    figure = posterior_plots.corner(toy_posterior(), NAMES, values, known, "two")
+    figure = posterior_report.corner(toy_posterior(), NAMES, values, known, "two")
     marks = [first_coordinates(axes) for axes in figure.axes]
     assert 0.61 in marks[0][0] and 0.61 in marks[2][0]
     assert {0.5, 0.4} <= marks[2][1] and {0.5, 0.4} <= marks[3][0]
     (name,) = names = NAMES[:1]
-    figure = posterior_plots.corner(
+    figure = posterior_report.corner(
         toy_posterior(names), names, {name: 0.61}, {name: 0.55}, "one", space_of(names)
     )
     (axes,) = figure.axes
@@ -487,7 +487,7 @@ def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters_or_i
 def test_contours_hold_the_parts_of_the_samples_that_the_legend_says():
     u = np.random.default_rng(0).normal(size=(500, 40, 2)) @ np.array([[1.0, 0.8], [0.0, 0.3]])
     posterior = posterior_of(NAMES, u, u, burn_in=0)
-    figure = posterior_plots.corner(posterior, NAMES, {}, None, "two")
+    figure = posterior_report.corner(posterior, NAMES, {}, None, "two")
     contours = figure.axes[2].collections[-1]
     inside = [path.contains_points(u.reshape(-1, 2)).mean() for path in contours.get_paths()]
     assert inside == pytest.approx([0.86, 0.39], abs=0.04)
@@ -496,7 +496,7 @@ def test_contours_hold_the_parts_of_the_samples_that_the_legend_says():
 
 
 def test_the_legend_of_a_chain_says_how_many_of_its_walkers_are_drawn():
-    figure = posterior_plots.chain(invented_posterior(), list(VALUES), None, "chain")
+    figure = posterior_report.chain(invented_posterior(), list(VALUES), None, "chain")
     assert [len(axes.lines) for axes in figure.axes] == [12] * (1 + len(VALUES))
     (legend,) = figure.legends
     labels = [text.get_text() for text in legend.texts]
