@@ -404,7 +404,7 @@ def _bars(
     """One measure of all systems, with the value at the end of each bar."""
     values = [getattr(measured, key) for measured in measures.values()]
     widths = MEASURES[key].factor * np.nan_to_num(values)
-    rows = np.arange(len(values))
+    rows = range(len(values))
     axes.barh(rows, widths, color=[styles[name]["color"] for name in measures], height=0.7)
     for row, width, value in zip(rows, widths, values, strict=True):
         style.write_beside(axes, MEASURES[key].format(value), width, row, 4)
