@@ -44,6 +44,7 @@ class Proportion:
 
 def proportion(
     hits: Bool[np.ndarray, "replicates quantities"],
+    counted: Bool[np.ndarray, "replicates quantities"] | None = None,
     *,
     level: float,
     wanted: tuple[float, float] = (0.0, 1.0),
@@ -56,15 +57,19 @@ def proportion(
 
     Args:
         hits: where it holds.
+        counted: the cases; None for all.
         level: of the bounds, 0.95 for instance.
         wanted: range in which the probability should lie.
     """
-    cases = float(hits.size)
-    if hits.shape[1] > 1 and hits.size:
-        cases = min(cases, _independent_cases(hits, level))
-    fraction = float(hits.mean()) if hits.size else 0.0
+    counted = np.ones_like(hits) if counted is None else counted
+    sizes, successes = counted.sum(axis=1), (hits & counted).sum(axis=1)
+    total, hit = int(sizes.sum()), int(successes.sum())
+    cases = float(total)
+    if hits.shape[1] > 1 and total:
+        cases = min(cases, _independent_cases(successes, sizes, level))
+    fraction = hit / total if total else 0.0
     low, high = clopper_pearson(fraction * cases, cases, level)
-    return Proportion(int(hits.sum()), hits.size, low, high, *wanted)
+    return Proportion(hit, total, low, high, *wanted)
 
 
 def clopper_pearson(hits: float, total: float, level: float) -> tuple[float, float]:
@@ -78,13 +83,14 @@ def clopper_pearson(hits: float, total: float, level: float) -> tuple[float, flo
     return float(low), float(high)
 
 
-def _independent_cases(hits: np.ndarray, level: float) -> float:
+def _independent_cases(successes: np.ndarray, sizes: np.ndarray, level: float) -> float:
     """Number of independent cases whose fraction varies as much as that of these replicates."""
-    replicates, total = len(hits), hits.size
+    replicates, total = len(sizes), sizes.sum()
     if replicates < 2:
         return float(replicates)
-    fraction = hits.mean()
-    variance = np.var(hits.sum(axis=1), ddof=1) / (replicates * hits.shape[1] ** 2)
+    fraction = successes.sum() / total
+    scatter = np.sum((successes - fraction * sizes) ** 2) / total**2
+    variance = scatter * replicates / (replicates - 1)
     if not variance > 0:  # every replicate has the same fraction
         return float(total)
     quantile = (1 + level) / 2  # the variance is itself estimated, from few replicates

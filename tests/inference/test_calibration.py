@@ -23,10 +23,11 @@ def test_bounds_are_those_of_scipys_exact_test():
             assert bounds == pytest.approx(tuple(expected)), (hits, total, level)
 
 
-def test_no_replicate_says_nothing_and_one_replicate_says_as_much_as_one_case():
-    some = proportion(np.array([[True, False], [True, True]]), level=0.95)
-    assert (some.hits, some.total) == (3, 4)
-    nothing = proportion(np.zeros((0, 2), bool), level=0.95)
+def test_only_what_counts_is_counted_and_one_replicate_says_as_much_as_one_case():
+    hits, counted = np.array([[True, False], [True, True]]), np.array([[True, True], [False, True]])
+    some = proportion(hits, counted, level=0.95)
+    assert (some.hits, some.total) == (2, 3)
+    nothing = proportion(hits, np.zeros((2, 2), bool), level=0.95)
     assert (nothing.hits, nothing.total, nothing.low, nothing.high) == (0, 0, 0.0, 1.0)
     assert np.isnan(nothing.fraction) and nothing.inside
     replicate = proportion(np.ones((1, 5), bool), level=0.95)
