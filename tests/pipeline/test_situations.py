@@ -1,6 +1,7 @@
 """Situations from bug reports of others, with the presets as they come: what is right in each."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,29 +18,57 @@ from support.cases import QUICK
 from support.clips import to_frames, to_rig
 
 FRAMES, HZ = 120, 60.0
-FLOOR = 0.0
 GAMES = ("ozz", "unreal", "mec")
+TOES = standing()[0, 2] + 0.12  # m, ahead of the root
+APART = 20.0  # m, from the middle of one place to that of the next
+
+# Level rectangles, each by its height and its ends in x and z, m. All situations stand side by side
+# on one ground, so that each preset is one program.
+BENCH = (0.45, -0.4, 0.4, -0.8, 0.0)
+PLACES = {
+    "floor": [(0.0, -9, 9, -9, 9)],
+    "under a roof at 2.4 m": [(0.0, -9, 9, -9, 9), BENCH, (2.4, -5, 5, -5, 5)],
+    "under a roof at 5 m": [(0.0, -9, 9, -9, 9), BENCH, (5.0, -5, 5, -5, 5)],
+    "dip": [(-0.2, -9, 9, -9, 9), (0.0, -5, 0, -5, 5)],
+    "block": [(0.0, -9, 9, -9, 9), (0.12, 0.05, 5, -5, 5)],
+    "ledge": [(-0.15, -9, 9, -9, 9), (0.0, -5, 5, -5, TOES)],
+}
 
 
-def boxes(floor: float, *tops: tuple[float, float, float, float, float]) -> terrain.Terrain:
-    """A floor with level tops over it, each by its height and its ends in x and z, m."""
-    vertices = [(9.0, floor, -9.0), (-9.0, floor, -9.0), (0.0, floor, 18.0)]
-    triangles = [(0, 1, 2)]
-    for height, left, right, back, front in tops:
-        first = len(vertices)
-        vertices += [(x, height, z) for x in (left, right) for z in (back, front)]
-        triangles += [(first, first + 1, first + 2), (first + 1, first + 3, first + 2)]
+def middle(place: str) -> np.ndarray:
+    return np.array([APART * list(PLACES).index(place), 0.0, 0.0])
+
+
+@functools.cache
+def ground() -> terrain.Terrain:
+    vertices, triangles = [], []
+    for place, rectangles in PLACES.items():
+        for height, left, right, back, front in rectangles:
+            first = len(vertices)
+            corners = [(x, height, z) for x in (left, right) for z in (back, front)]
+            vertices += [middle(place) + corner for corner in corners]
+            triangles += [(first, first + 1, first + 2), (first + 1, first + 3, first + 2)]
     return terrain.mesh(np.array(vertices), np.array(triangles))
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def run(ik: jaxik.FootIK, ground: terrain.Terrain, frames: jaxik.Frame) -> jaxik.Result:
+def solved(ik: jaxik.FootIK, ground: terrain.Terrain, frames: jaxik.Frame) -> jaxik.Result:
     return jaxik.run(ik, to_rig(clips.make_rig()), ground, frames)
 
 
-def standing_clip(**motion: Any) -> jaxik.Frame:
-    """A character that stands, and moves as a whole as these functions of the time say."""
-    return to_frames(clips.animate(clips.make_rig(), count=FRAMES, hz=HZ, **motion))
+def run(preset: str, frames: jaxik.Frame) -> jaxik.Result:
+    return solved(getattr(jaxik.presets, preset)(), ground(), frames)
+
+
+def standing_clip(
+    where: str, way: Callable[[float], Any] = lambda time: (0.0, 0.0, 0.0), **motion: Any
+) -> jaxik.Frame:
+    """A character that stands there and moves as a whole as these functions of the time say."""
+    rig = clips.make_rig()
+    frames = clips.animate(
+        rig, count=FRAMES, hz=HZ, place=lambda time: middle(where) + way(time), **motion
+    )
+    return to_frames(frames)
 
 
 def ankles(result: jaxik.Result) -> np.ndarray:
@@ -47,11 +76,9 @@ def ankles(result: jaxik.Result) -> np.ndarray:
 
 
 @pytest.mark.parametrize("preset", GAMES)
-@pytest.mark.parametrize("roof", [2.4, 5.0])
-def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, roof: float):
-    above = boxes(FLOOR, (0.45, -0.4, 0.4, -0.8, 0.0), (roof, -5, 5, -5, 5))
-    frames = standing_clip()
-    result = run(getattr(jaxik.presets, preset)(), above, frames)
+@pytest.mark.parametrize("place", [place for place in PLACES if "roof" in place])
+def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, place: str):
+    result = run(preset, standing_clip(place))
     np.testing.assert_allclose(result.body.pos, 0.0, atol=0.05)
     assert ankles(result)[..., 1].max() < ANKLE + 0.05
 
@@ -59,9 +86,9 @@ def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, ro
 @pytest.mark.parametrize("yaw, push", [(1.0, 0.0), (0.0, 0.2)])
 def test_mec_lets_go_of_a_foot_that_its_body_leaves(yaw: float, push: float):
     frames = standing_clip(
-        heading=lambda time: yaw * time, place=lambda time: np.array([0.0, 0.0, push * time])
+        "floor", way=lambda time: (0.0, 0.0, push * time), heading=lambda time: yaw * time
     )
-    result = run(jaxik.presets.mec(), boxes(FLOOR), frames)
+    result = run("mec", frames)
     away = np.linalg.norm(ankles(result) - frames.pose.ankle.pos, axis=-1)
     turned = np.degrees(np.asarray(quat.angle(result.pose.ankle.rot, frames.pose.ankle.rot)))
     assert 0.05 < max(away.max(), turned.max() / 90) and away.max() < 0.2 and turned.max() < 35.0
@@ -72,25 +99,21 @@ def test_mec_lets_go_of_a_foot_that_its_body_leaves(yaw: float, push: float):
 
 
 def test_a_leg_of_mec_reaches_into_a_dip():
-    dip = boxes(-0.2, (0.0, -5.0, 0.0, -5.0, 5.0))
-    lowered = ankles(run(jaxik.presets.mec(), dip, standing_clip()))[-1, :, 1] - ANKLE
+    lowered = ankles(run("mec", standing_clip("dip")))[-1, :, 1] - ANKLE
     np.testing.assert_allclose(sorted(lowered), [-0.2, 0.0], atol=0.01)
 
 
 def test_unreal_takes_a_captured_idle_for_standing():
-    block = boxes(FLOOR, (0.12, 0.05, 5.0, -5.0, 5.0))
-    sway = standing_clip(place=lambda time: [0.002 * np.sin(5.0 * time), 0.0, 0.0])
+    sway = standing_clip("block", way=lambda time: (0.002 * np.sin(5.0 * time), 0.0, 0.0))
     assert 0.0 < np.asarray(sway.speed)[1:].max() < 0.02
-    raised = ankles(run(jaxik.presets.unreal(), block, sway))[-1, :, 1] - ANKLE
+    raised = ankles(run("unreal", sway))[-1, :, 1] - ANKLE
     np.testing.assert_allclose(sorted(raised), [0.0, 0.12], atol=0.01)
 
 
 @pytest.mark.parametrize("preset", ["record", "mec"])
 def test_a_foot_whose_toes_are_over_a_ledge_stays_level(preset: str):
-    toes = standing()[0, 2] + 0.12
-    ledge = boxes(-0.15, (0.0, -5.0, 5.0, -5.0, toes))
-    frames = standing_clip()
-    result = run(getattr(jaxik.presets, preset)(), ledge, frames)
+    frames = standing_clip("ledge")
+    result = run(preset, frames)
     assert np.degrees(quat.angle(result.pose.ankle.rot, frames.pose.ankle.rot)).max() < 12.0
     np.testing.assert_allclose(ankles(result)[-1], frames.pose.ankle.pos[-1], atol=0.01)
 
