@@ -93,7 +93,7 @@ class Played(NamedTuple):
         return at(self, number)
 
 
-@pytest.fixture(scope="module", params=["record", "mec"])
+@pytest.fixture(scope="module", params=["mec", pytest.param("record", marks=pytest.mark.slow)])
 def played(request: pytest.FixtureRequest) -> Played:
     """By the two presets that remember most."""
     ik = getattr(jaxik.presets, request.param)()

@@ -63,6 +63,10 @@ CASES: dict[str, tuple[Any, ...]] = {  # system, values, and how the clip is unl
     "by speed": ("by speed", {}, "unknown", "leaps"),
     "by speed, odd and sprung": ("by speed", ODD | SUPPORT | SPRUNG),
 }
+STRIDES = [name for name, case in CASES.items() if case[0] == "stride"]
+BY_SPEED = [  # rules that no preset has, in a program of their own
+    pytest.param(name, marks=pytest.mark.slow) for name in CASES if name not in STRIDES
+]
 RIG = sample_poses.make_rig(np.random.default_rng(4))
 UNEVEN = dataclasses.replace(blocks(np.random.default_rng(3)), platform=0)
 compiled = jax.jit(jaxik.run, compiler_options=QUICK)
@@ -136,7 +140,7 @@ def test_the_defaults_are_those_of_the_reference(name):
         np.testing.assert_allclose(actual, expected, rtol=1e-6, err_msg=key)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [*STRIDES, *BY_SPEED])
 def test_a_clip_agrees_with_the_reference(name):
     """Of `stride`, each leg has its numbers and a terrain, in one case with its own up."""
     preset, values, *unlike = CASES[name]

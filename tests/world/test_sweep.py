@@ -189,7 +189,10 @@ def test_a_shape_that_starts_at_rest_high_up_has_come_no_way():
     np.testing.assert_allclose(again.distance, 0.0, rtol=0, atol=1e-12)
 
 
-@each_shape
+@pytest.mark.parametrize(
+    "half",
+    [pytest.param(None, id="sphere"), pytest.param(HALF, id="capsule", marks=pytest.mark.slow)],
+)
 def test_gradients_are_those_of_differences(half):
     ground = field(HEIGHTS[::-1], "bilinear") if half is None else mesh()
     step = 1e-6
