@@ -61,6 +61,9 @@ from jaxik.world.terrain import Terrain, moving
 
 from .fit import run_folder
 
+# Frames: clips are played in a multiple of it, as each length is a program of its own, which takes
+# seconds to compile; a frame takes microseconds.
+PADDED = 128
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
 
@@ -163,10 +166,16 @@ class Animation:
         return result, solved
 
     def run(self, ik: jaxik.FootIK) -> jaxik.Result:
-        """The result of a system on the terrain, which its probe has prepared."""
-        tracks = {name: jnp.asarray(values) for name, values in self.tracks.items()}
-        rig, frames = self.clip.rig, self.frames
-        return program_cache.run(ik, rig, self.terrain, frames, tracks=tracks or None)
+        """The result of a system on the terrain, which its probe has prepared; NumPy arrays."""
+        count = len(self.frames.dt)
+        repeats = -count % PADDED  # of the last frame, which change nothing before them
+
+        def pad(x: jax.Array | np.ndarray) -> np.ndarray:
+            return np.concatenate([x, np.repeat(x[-1:], repeats, axis=0)])
+
+        frames, tracks = jax.tree.map(pad, (self.frames, dict(self.tracks)))
+        result = program_cache.run(ik, self.clip.rig, self.terrain, frames, tracks=tracks or None)
+        return jax.tree.map(lambda x: x[:count], jax.device_get(result))
 
     def reached(self, result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
         """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.
