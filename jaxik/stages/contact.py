@@ -44,7 +44,10 @@ class AbstractInstantContact(AbstractContact):
 
 
 class HeightContact(AbstractInstantContact):
-    """Contact by ankle height: 1 up to `planted_height`, 0 from `raised_height`, linear between."""
+    """Contact by ankle height: 1 up to `planted_height`, 0 from `raised_height`, linear between.
+
+    A limb that bears nothing, such as a hand on a wall, stands at any height.
+    """
 
     ground_height: Leaf = parameter(
         0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
@@ -78,7 +81,13 @@ class HeightContact(AbstractInstantContact):
         fraction = vec.safe_divide(self.raised_height - lift, span)
         zeros, ones = jnp.zeros_like(lift), jnp.ones_like(lift)
         ramp = gate.clip(fraction, zeros, ones, band=0.1)
-        return Contact(lift, jnp.where(span > 0, ramp, planted), planted, lifted)
+        weight = jnp.where(span > 0, ramp, planted)
+        return Contact(
+            lift,
+            _at_any_height(inputs, weight),
+            _at_any_height(inputs, planted),
+            lifted * inputs.bearing,
+        )
 
 
 class StandingContact(AbstractInstantContact):
@@ -139,7 +148,8 @@ class SpeedContact(AbstractContact):
     or fast, by larger thresholds, so that a foot near a threshold does not flicker. Gait
     laboratories detect contact in this way (foot velocity algorithm, O'Connor et al. 2007, there
     with the centre of the foot). The ball of a standing foot is slower than 0.25 m/s; that of a
-    swinging foot rarely is.
+    swinging foot rarely is. A limb that bears nothing, such as a hand on a wall, only needs to be
+    slow.
     """
 
     ground_height: Leaf = parameter(
@@ -197,6 +207,7 @@ class SpeedContact(AbstractContact):
         slow = gate.below(speed, self.planted_speed, band=SPEED_BAND)
         not_raised = gate.below(height, self.raised_height, band=HEIGHT_BAND)
         not_fast = gate.below(speed, self.raised_speed, band=SPEED_BAND)
+        low, not_raised = (_at_any_height(inputs, x) for x in (low, not_raised))
         planted = low * slow
         return Contact(lift, planted, planted, 1.0 - not_raised * not_fast)
 
@@ -211,3 +222,8 @@ class SpeedContact(AbstractContact):
         fraction = now.progress(smoothing.fraction_of_half_life(self.half_life, now.dt))
         weight = smoothing.lerp(state.weight, standing, fraction)
         return SpeedState(standing, weight), Contact(contact.lift, weight, standing, 1.0 - standing)
+
+
+def _at_any_height(inputs: Inputs, low: Array) -> Float[Array, " legs"]:
+    """0..1, how far legs count as low: by their heights as far as they bear the body."""
+    return smoothing.lerp(low, jnp.ones_like(low), 1.0 - inputs.bearing)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import place, struct
-from jaxik.world.frame import Sensed
+from jaxik.world.frame import Sensed, counted
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import SensedMoment
@@ -249,24 +249,26 @@ class BodyEffector(AbstractEffector):
         sensed = now.sensed
         awake = self.awake(now, state)
         requested = requested_heights(sensed, target.pos)
-        goal = requested - pelvis.goal
+        goal = requested - sensed.bearing * pelvis.goal
         fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
         fraction = awake * now.progress(fraction)
         height = smoothing.lerp(state.height, goal, fraction)
 
         near = now.gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
-        arrived = jnp.prod(1.0 - sensed.counted * (1.0 - near))
+        arrived = jnp.prod(1.0 - counted(sensed.weight) * (1.0 - near))
         may_sleep = jnp.where(self.latch, self._stands(now), 0.0)
         asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
-        offset_ws = vec.scale(sensed.leg_up_ws, height - requested) + pelvis.offset_ws
+        # What does not bear the body does not move with it either.
+        carried_ws = vec.scale(pelvis.offset_ws, sensed.bearing)
+        offset_ws = vec.scale(sensed.leg_up_ws, height - requested) + carried_ws
         effector = Effector(target.pos + offset_ws, target.rot, jnp.ones_like(height))
         return BodyState(height, asleep), effector
 
     def _stands(self, now: SensedMoment) -> Float[Array, ""]:
         """1 while all feet with foot IK stand."""
         sensed = now.sensed
-        standing = 1.0 - sensed.counted * (1.0 - sensed.contact.planted)
+        standing = 1.0 - counted(sensed.weight) * (1.0 - sensed.contact.planted)
         return now.gate.minimum(standing, band=0.1)
 
 

@@ -149,9 +149,8 @@ class SpeedFade(AbstractFade):
         sensed = now.sensed
         lengths = jnp.where(sensed.present, sensed.thigh + sensed.shin, 0.0)
         reach = HARD.maximum(lengths, band=0.0)
-        unfaded = HARD.maximum(
-            jnp.where(sensed.present, jnp.abs(weight - state.weight), 0.0), band=0.0
-        )
+        change = sensed.bearing * jnp.abs(weight - state.weight)
+        unfaded = HARD.maximum(jnp.where(sensed.present, change, 0.0), band=0.0)
         state = self._with_speed(now, weight, unfaded, state)
         legs_share = jnp.clip(unfaded / FADING, 0.0, 1.0)
         limit = state.speed * (1.0 - (1.0 - BODY_SHARE) * legs_share) * now.dt

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import struct
 from jaxik.world import places
-from jaxik.world.frame import Frame, Sensed
+from jaxik.world.frame import Frame, Sensed, bearing
 from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
@@ -23,6 +23,11 @@ class Inputs:
     gate: AbstractGate
     centre_ws: Float[Array, "3"] | None = None
     """m, where world space has its origin now; None where that has not changed."""
+
+    @property
+    def bearing(self) -> Float[Array, "*legs"]:
+        """0..1, how far each leg bears the body; see `jaxik.world.frame.bearing`."""
+        return bearing(self.terrain.leg_up_ws, self.terrain.up_ws)
 
     def at(self, frame: Frame, faulty: Bool[Array, " legs"] | None = None) -> "Inputs":
         """The inputs of one frame, with what moves of the terrain where it then is.

@@ -67,7 +67,8 @@ class SlopeTarget(AbstractTarget):
     ankle `h / (n·u)` above the hit, plus the lift. The height follows the ground with one half-life
     up and one down, as an exponential or, with `spring` on, as a critically damped spring. The
     ankle then stays between two heights in model space. Without ground the foothold is that of the
-    animation.
+    animation. A limb that bears nothing, such as a hand on a wall, has no animated lift: its sole
+    lies on the ground where it stands, and where it does not it stays as animated.
     """
 
     min_ankle_height: Leaf = parameter(
@@ -113,9 +114,14 @@ class SlopeTarget(AbstractTarget):
         frame, gate = inputs.frame, inputs.gate
         ankle_height = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         standing = hit.point + vec.scale(up_ws, ankle_height - self.foot_height)
-        without_ground = _below(animated_ankles(frame).pos, up_ws, contact.lift)
+        ankle_ws = animated_ankles(frame).pos
+        away = vec.dot(ankle_ws - standing, up_ws)
+        away = jnp.where(away > self.foot_height, away, self.foot_height)
+        on_wall = smoothing.lerp(away, self.foot_height, contact.weight)
+        lift = smoothing.lerp(contact.lift, on_wall, 1.0 - inputs.bearing)
+        without_ground = _below(ankle_ws, up_ws, lift)
         point_ws = smoothing.lerp(without_ground, standing, hit.found[..., None])
-        lift = contact.lift if ground.lift is None else contact.lift + ground.lift
+        lift = lift if ground.lift is None else lift + ground.lift
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
     def advance(
@@ -143,7 +149,8 @@ class SlopeTarget(AbstractTarget):
         rise = height - goal
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)
-        return TargetState(height, velocity, foothold.point_ws), rise + (kept - ankle)
+        limited = now.sensed.bearing * (kept - ankle)
+        return TargetState(height, velocity, foothold.point_ws), rise + limited
 
     def _climb(self, now: SensedMoment, state: TargetState) -> Float[Array, " legs"]:
         """m, by which the slope rises over each foothold's way since the previous frame."""
@@ -215,7 +222,8 @@ class RootTarget(AbstractInstantTarget):
     """Moves a standing foot by the ground's height above the root, plus `adjust` (Unreal).
 
     The animated height above the root is kept: the animation was made for ground at root height. A
-    foot that finds no ground or does not stand keeps its place.
+    foot that finds no ground or does not stand keeps its place. A limb that bears nothing, such as
+    a hand on a wall, stands with its sole on the ground.
     """
 
     adjust: Leaf = parameter(
@@ -231,9 +239,10 @@ class RootTarget(AbstractInstantTarget):
         frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
         hit, ankle_ws = ground.ankle, animated_ankles(frame).pos
         height_above_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
+        height = smoothing.lerp(height_above_root, inputs.rig.ankle_height, 1.0 - inputs.bearing)
         standing = contact.weight * hit.found
-        lift = height_above_root + standing * self.adjust
-        without_ground = _below(ankle_ws, up_ws, height_above_root)
+        lift = height + standing * self.adjust
+        without_ground = _below(ankle_ws, up_ws, height)
         point_ws = smoothing.lerp(without_ground, hit.point, standing[..., None])
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 

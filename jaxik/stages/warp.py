@@ -66,7 +66,11 @@ class StrideWarp(AbstractWarp):
             frame.stride_scale, self.min_scale, self.max_scale, band=SCALE_BAND
         )
         ball = frame.world_from_model.apply(frame.pose.toe.pos)
-        offset = vec.reject(ball - frame.world_from_model.pos, up_ws)
+        # What does not bear the body keeps its height over the floor as well.
+        offset = ball - frame.world_from_model.pos
+        body_up_ws = inputs.terrain.up_ws
+        height = (1.0 - inputs.bearing) * vec.dot(offset, body_up_ws)
+        offset = vec.reject(offset - vec.scale(body_up_ws, height), up_ws)
         ahead_ws, _ = heading(frame.world_from_model, up_ws)
         way = vec.normalize(vec.reject(frame.velocity_ws, up_ws), ahead_ws)
         across = vec.reject(offset, way)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from jaxik.maths import quat, vec
-from jaxik.maths.smoothing import clip_to_one
+from jaxik.maths.smoothing import clip_to_one, smoothstep
 from jaxik.maths.struct import place, struct
 
 from .skeleton import LegPose, Rig, Still, Transform
@@ -15,6 +15,8 @@ from .terrain import Hit
 FORWARD = (0.0, 0.0, 1.0)  # model space
 UP = (0.0, 1.0, 0.0)  # model space
 COUNTS = 0.1  # weight, of a leg or of all, from which it counts in full for what moves the body
+# Cosines between the ups of a leg and of the body from which the leg bears, and bears in full.
+LEAST_BEARING, FULL_BEARING = 0.3, 0.7
 
 
 @struct
@@ -250,9 +252,19 @@ class Sensed:
     """m, by which scaled strides move ankles and balls, which have moved already; None for none."""
 
     @property
+    def bearing(self) -> Float[Array, "*legs"]:
+        """0..1, see `bearing`."""
+        return bearing(self.leg_up_ws, self.up_ws)
+
+    @property
+    def load(self) -> Float[Array, " legs"]:
+        """0..1, the weight with which each leg moves the body: that of a hand on a wall is 0."""
+        return self.weight * self.bearing
+
+    @property
     def counted(self) -> Float[Array, " legs"]:
-        """0..1, how far each leg counts for what moves the body, whatever its weight is then."""
-        return counted(self.weight)
+        """0..1, how far each leg counts for what moves the body, whatever its load is then."""
+        return counted(self.load)
 
     @property
     def unscaled_ankle_ws(self) -> Float[Array, "legs 3"]:
@@ -274,6 +286,19 @@ class Sensed:
 def counted(weight: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """0..1, how far what has this weight counts: nothing changes as soon as there is some."""
     return clip_to_one(weight / COUNTS)
+
+
+def bearing(leg_up_ws: Float[Array, "*legs 3"], up_ws: Float[Array, "3"]) -> Float[Array, "*legs"]:
+    """0..1, how far each leg bears the body; 1 for all where they share its up.
+
+    A limb whose up is far from the body's, such as a hand on a wall or on a ceiling, bears nothing:
+    its ground says nothing of how high the body is or how it leans, nor does its height over the
+    animation's floor say whether it stands.
+    """
+    if leg_up_ws.ndim == up_ws.ndim:
+        return jnp.ones_like(up_ws[..., 0])
+    cosine = vec.dot(leg_up_ws, up_ws)
+    return smoothstep((cosine - LEAST_BEARING) / (FULL_BEARING - LEAST_BEARING))
 
 
 def rise_of(

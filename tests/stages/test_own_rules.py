@@ -193,6 +193,7 @@ def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=H
             warp_ws=None,
             ground=fragment(GroundHits, ankle=fragment(Hit, normal=normal)),
             foothold=fragment(Foothold, found=jnp.ones_like(weight)),
+            up_ws=up,
             leg_up_ws=up,
         )
         ground = fragment(Terrain, up_ws=up)

@@ -101,7 +101,7 @@ def moment(started: Any = True, **sensed) -> SensedMoment:
     """A frame of a character on ground whose up is +y, with what the rule reads of it."""
     up = jnp.asarray(UP)
     arrays = {name: jnp.asarray(x) for name, x in sensed.items() if isinstance(x, np.ndarray)}
-    frame = fragment(Sensed, leg_up_ws=up, carry=Still(), **(sensed | arrays))
+    frame = fragment(Sensed, up_ws=up, leg_up_ws=up, carry=Still(), **(sensed | arrays))
     ground = fragment(Terrain, up_ws=up)
     return SensedMoment(jnp.asarray(DT), jnp.asarray(started), HARD, frame, ground)
 

@@ -89,6 +89,7 @@ def standing_slope(inputs: Inputs, ground: GroundHits, contact: Contact, weight:
     up_ws = inputs.terrain.up_ws
     forward_ws, right_ws = heading(inputs.frame.world_from_model, up_ws)
     stands = jnp.where(inputs.rig.present, contact.weight * ground.ankle.found, 0.0)
+    stands = stands * inputs.bearing
     standing = stands * weight
     normal = vec.sum_vectors(vec.scale(ground.ankle.normal, standing))
     total = vec.sum_last(standing)

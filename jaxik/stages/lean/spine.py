@@ -122,9 +122,8 @@ class SpineLean(AbstractLean):
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         soles = standing_slope(inputs, ground, contact, weight)
-        standing = vec.sum_last(contact.weight * ground.ankle.found * weight)
-        sure = counted(standing)
-        weight = weight * ground.ankle.found
+        weight = weight * ground.ankle.found * inputs.bearing
+        sure = counted(vec.sum_last(contact.weight * weight))
         known = counted(vec.sum_last(weight))
         weight = vec.safe_divide(weight, vec.sum_last(weight))
         points = ground.ankle.point - inputs.frame.world_from_model.pos

@@ -80,8 +80,8 @@ class AbstractPelvis(Rule):
 
 
 def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
-    """Mean of requested heights, m, weighted by foot IK of each leg; 0 if no leg counts."""
-    mean = vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
+    """Mean of requested heights, m, weighted by the load of each leg; 0 if no leg counts."""
+    mean = vec.safe_divide(vec.sum_last(sensed.load * requested), vec.sum_last(sensed.load))
     return mean * greatest_count(sensed)
 
 
@@ -96,7 +96,7 @@ def lifted_out(sensed: Sensed, heights: Array, most: Array | float = 1.0) -> Flo
     Without `most`, a leg that does not count in full limits less, even if none counts more.
     """
     away = heights + AWAY * (most - sensed.counted)
-    return jnp.where(sensed.weight > 0, away, FAR)
+    return jnp.where(sensed.load > 0, away, FAR)
 
 
 def lowest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:

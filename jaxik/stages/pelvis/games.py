@@ -61,7 +61,7 @@ class LowestPelvis(AbstractPelvis):
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
         requested = requested_heights(sensed, target.pos)
-        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.load
         highest = highest_of(gate, sensed, requested)
         of_standing = smoothing.lerp(highest, requested, weight)
         lowest = gate.minimum(of_standing, band=HEIGHT_BAND)

@@ -112,7 +112,7 @@ class SupportPelvis(AbstractFollowingPelvis):
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
-        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.load
         total = vec.sum_last(weight)
         lowest = lowest_of(gate, sensed, requested)
         support = vec.safe_divide(vec.sum_last(weight * requested), total)

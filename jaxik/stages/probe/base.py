@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Rule
@@ -55,6 +55,18 @@ class AbstractProbe(Rule):
     @abstractmethod
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         """The ground under each leg in this frame; `foot_height` is from sole to ankle, m."""
+
+
+def level_origin(inputs: Inputs) -> Float[Array, "*#legs 3"]:
+    """Where the level of each leg is, m, world space, from which steps of its ground count.
+
+    That of legs is the character's root. One that bears nothing, such as a hand on a wall, has no
+    level but its own animated place.
+    """
+    root_ws = inputs.frame.world_from_model.pos
+    if isinstance(inputs.terrain, Terrain):
+        return root_ws
+    return lerp(root_ws, animated_ankles(inputs.frame).pos, 1.0 - inputs.bearing[:, None])
 
 
 def separate(hits: Hit) -> list[Hit]:

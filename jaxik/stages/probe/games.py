@@ -12,6 +12,7 @@ from jaxik.world.terrain import Hit
 
 from .base import (
     foot_heading,
+    level_origin,
     make_rays,
     no_hit,
     on_same_ground,
@@ -101,8 +102,8 @@ class RootProbe(AbstractLimitedProbe):
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         terrain, frame = inputs.terrain, inputs.frame
         up, ankle_ws = terrain.leg_up_ws, animated_ankles(frame).pos
-        over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
-        start = ankle_ws + vec.scale(up, self.ray_up - over_root)
+        over_level = vec.dot(ankle_ws - level_origin(inputs), up)
+        start = ankle_ws + vec.scale(up, self.ray_up - over_level)
         hit = self.cast(inputs, start, self.ray_up + self.ray_down, self.layers)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.zeros_like(hit.found), rays)
@@ -220,7 +221,7 @@ class CornerProbe(AbstractLimitedProbe):
     def _extra(self, inputs: Inputs, foot_ws: Array, up_ws: Array) -> Array:
         """How far below a standing sole the rays of each foot end, m."""
         frame, gate = inputs.frame, inputs.gate
-        height = vec.dot(foot_ws - frame.world_from_model.pos, up_ws)
+        height = vec.dot(foot_ws - level_origin(inputs), up_ws)
         low = gate.below(height, self.stable_height, band=HEIGHT_BAND)
         slow = gate.below(frame.foot_speed, self.stable_speed, band=SPEED_BAND)
         stable = jnp.where(self.by_height, low, 1.0) * jnp.where(self.by_speed, slow, 1.0)

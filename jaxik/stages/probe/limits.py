@@ -13,7 +13,7 @@ from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
-from .base import AbstractProbe, foot_heading
+from .base import AbstractProbe, foot_heading, level_origin
 
 RING = tuple(  # forward and right of the rays that look for support around a foothold
     (math.cos(turn), math.sin(turn)) for turn in (i * math.pi / 4 for i in range(8))
@@ -26,10 +26,10 @@ SAME_GROUND = 1e-3  # m, between hits of one surface at most
 class AbstractLimitedProbe(AbstractProbe):
     """Rays that refuse ground which is too high, too low, too steep or, if asked to, too narrow.
 
-    Steps are measured from the level of the character's root, and only by what is not a slope: of
-    ground that rises evenly from below the root nothing is a step. Where the highest ground below a
-    ray is refused, that below the highest step counts, such as the floor under a table. Where that
-    is refused too, there is no ground, and the foot stays as animated.
+    Steps are measured from the level of the character's root (`level_origin`), and only by what is
+    not a slope: of ground that rises evenly from below the root nothing is a step. Where the
+    highest ground below a ray is refused, that below the highest step counts, such as the floor
+    under a table. Where that is refused too, there is no ground, and the foot stays as animated.
 
     With `check_support` eight rays around each foothold, `support_radius` from it, look for ground
     that goes on as it is there, neither higher nor lower by more than that radius. A post has none
@@ -108,14 +108,14 @@ class AbstractLimitedProbe(AbstractProbe):
         if not self.limited:
             return self.find(inputs, starts_ws, reach, layers)
         margin = jnp.zeros_like(starts_ws[..., 0]) if margin is None else margin
-        root = inputs.frame.world_from_model.pos
-        above = vec.dot(starts_ws - root, up) - self.max_step_up - margin
+        origin = level_origin(inputs)
+        above = vec.dot(starts_ws - origin, up) - self.max_step_up - margin
         above = jnp.where(above > 0, above, 0.0)
         # Both by one search: each search adds much to a program.
         starts = jnp.stack([starts_ws, starts_ws - vec.scale(up, above)])
         reaches = jnp.stack([reach + jnp.zeros_like(above), reach - above])
         hits = self.find(inputs, starts, reaches, layers)
-        accepted = hits.found * self.trust_from(root, hits, up, margin)
+        accepted = hits.found * self.trust_from(origin, hits, up, margin)
         if self.check_support and stood_on:
             accepted *= self._trust_of_width(inputs, starts, reaches, hits, layers)
         first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
@@ -162,11 +162,11 @@ class AbstractLimitedProbe(AbstractProbe):
         """
         return climb(normal, way, up_ws) * self.gentleness(normal, up_ws)
 
-    def trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
-        """0..1, how far each hit is accepted by a character whose root is there."""
+    def trust_from(self, origin_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
+        """0..1, how far each hit is accepted where the level goes through that origin."""
         if not self.limited:
             return self.gentleness(hits.normal, up_ws)
-        way = hits.point - root_ws
+        way = hits.point - origin_ws
         rise = vec.dot(way, up_ws)
         slope = least_rise(rise, climb(hits.normal, way, up_ws))
         step = rise - slope

@@ -140,7 +140,7 @@ class StrideProbe(AbstractSupportedProbe):
         return swings, self._known_or(watched.stride, *predicted, watched.up_ws)
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
-        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        level = Level.of(inputs)
         remembered = self.remember_swings
         stride = inputs.frame.stride if remembered else self._stride(inputs, contact, level)
         support = None

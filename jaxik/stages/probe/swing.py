@@ -10,7 +10,7 @@ from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Stride, animated_ankles
 
-from .base import foot_heading
+from .base import foot_heading, level_origin
 from .limits import AbstractLimitedProbe, least_rise
 
 HEIGHT_BAND = 0.01  # m
@@ -26,11 +26,16 @@ ON_HEEL = 0.08  # rad, toes up, from which a foot of the animation is on its hee
 
 @struct
 class Level:
-    """The plane through the character's root, perpendicular to each leg's up."""
+    """The plane through the `level_origin` of each leg, perpendicular to its up."""
 
-    origin_ws: Float[Array, "3"]
+    origin_ws: Float[Array, "*#legs 3"]
     """Metres."""
     up_ws: Float[Array, "*legs 3"]
+
+    @classmethod
+    def of(cls, inputs: Inputs) -> "Level":
+        """That of a frame."""
+        return cls(level_origin(inputs), inputs.terrain.leg_up_ws)
 
     def height(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs"]:
         """Height of points above the plane, m."""
@@ -188,7 +193,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         lift += self.lift_per_fall * fall * bump(x, FALL)
         lift += self.lift_over * over * bump(x, OVER)
         down = uneven * self.toes_down + self.toes_down_per_height * total
-        share = jnp.where(self.swing_as_animated, 0.0, trust)
+        # Only feet swing as people swing them.
+        share = jnp.where(self.swing_as_animated, 0.0, trust) * inputs.bearing
         pitch = share * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
         first = jnp.where(self.swing_as_animated, 0.0, self.toes_first)
         pitch -= first * below * smoothstep(self._toe_angle(inputs) / ON_HEEL)
@@ -204,7 +210,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
 
     def _animated_lift(self, inputs: Inputs) -> Float[Array, " legs"]:
         """m, of the balls over a flat foot's."""
-        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        level = Level.of(inputs)
         lift = level.height(_balls(inputs)) - self.ball_height
         return jnp.where(lift > 0, lift, 0.0)
 
@@ -220,7 +226,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     ) -> Float[Array, " legs"]:
         """How far each foot's ground is below that of the highest other foot, m.
 
-        What the ground under both feet and between them rises by as a slope does not count.
+        What the ground under both feet and between them rises by as a slope does not count, nor do
+        legs that bear nothing.
 
         Args:
             inputs: the frame.
@@ -235,8 +242,9 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         climbs = self.climb(normal, way, up), self.climb(normal[:, None], way, up[:, None])
         slope = least_rise(rise, *climbs)
         counts = (found > 0) & (found[:, None] > 0) & inputs.rig.present
+        bears = jnp.broadcast_to(inputs.bearing, found.shape)
         below = jnp.where(counts & (rise - slope > 0), rise - slope, 0.0)
-        return jnp.max(below, axis=-1)
+        return jnp.max(bears * bears[:, None] * below, axis=-1)
 
     def highest(self, inputs: Inputs, heights: Array, found: Array) -> Float[Array, " legs"]:
         """The highest of heights of the ground on the way (points legs), m; 0 if all are below.
@@ -271,7 +279,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
             foot_height: of the ankles over the soles, m.
             edge: how far the highest edge is over the line between the footholds, m.
         """
-        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        level = Level.of(inputs)
         soles, ankle = self.soles(inputs, foot_height), animated_ankles(inputs.frame).pos
         # A sole that the animation sinks into its own floor needs no correction.
         lift = level.height(soles) - self.clearance
