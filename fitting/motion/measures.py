@@ -230,6 +230,12 @@ class Measures(Figures):
         f"Frames of each leg in which its ankle is {100 * STRAIGHT_REACH:g} % of the leg's length "
         "from its hip, or further.",
     )  # fmt: skip
+    lost_clearance: float = declared(
+        "lost clearance", "cm", 1,
+        "By how much lower over the ground than in the animation over its floor a foot swings: the "
+        "lower of its two points, where that is highest in a swing; median of all swings. Feet "
+        "that stay on the ground lose all of their clearance.",
+    )  # fmt: skip
     worst: Mapping[str, Extreme] = field(default_factory=dict)
     """Where a measure is worst, m, by name."""
     size: float = 1.0
@@ -386,6 +392,8 @@ def measure(
     lengths = np.stack([solved.rig.thigh, solved.rig.shin], axis=-1)
     pelvis = solved.positions_ws[:, solved.rig.pelvis, 1]
     standing = np.where(stance, gap, np.nan)
+    lost = _lost_clearances(feet, flat)
+    known_lost = lost[~np.isnan(lost)]
     return Measures(
         penetration=_mean(np.any(in_ground, axis=1), np.any(known, axis=1)),
         penetration_stance=_mean(in_ground, stance & known),
@@ -403,12 +411,14 @@ def measure(
         pelvis_jerk=jerk(pelvis, solved.fps, solved.cuts),
         reached=math.nan if reached is None else _mean(reached, stance & ~np.isnan(reached)),
         straight=_mean(straight(hip, ankle, lengths), np.ones(stance.shape, bool)),
+        lost_clearance=float(np.median(known_lost)) if known_lost.size else math.nan,
         worst={
             "penetration": _extreme(-gap, names),
             "floating": _extreme(standing, names),
             "contact": _extreme(np.abs(standing), names),
             "slide": _extreme(slides, names),
             "pop": _extreme(speed, names),
+            "lost_clearance": _extreme(lost, names),
         },
         size=size,
     )
@@ -447,6 +457,20 @@ def _foot_skating(feet: Soles, solved: Clip, size: float) -> float:
     known = ~np.isnan(height)
     skids = in_contact[1:] & in_contact[:-1] & (steps * solved.fps > SKID * size)
     return _mean(np.any(skids, axis=1), np.any(known[1:] & known[:-1], axis=1))
+
+
+def _lost_clearances(feet: Soles, flat: Clip) -> Float64[np.ndarray, "frames legs"]:
+    """By how much lower each swing is than animated, m, at its first frame; NaN elsewhere."""
+    sole = sole_points(flat)[..., 1].min(axis=-1)
+    lost = np.full(sole.shape, np.nan)
+    for leg, stance in enumerate(feet.stance.T):
+        if stance.any():
+            over_floor = sole[:, leg] - np.median(sole[stance, leg])
+            for first, last in contacts.runs(~stance):
+                swing = slice(first, last + 1)
+                highest = np.fmax.reduce(feet.gap[swing, leg])
+                lost[first, leg] = over_floor[swing].max() - highest
+    return lost
 
 
 def horizontal_steps(

@@ -210,6 +210,22 @@ def test_targets_that_standing_feet_reach_and_straight_legs_are_fractions(walk):
         assert measure(stretched).straight == fraction, reach
 
 
+def test_feet_that_swing_on_the_ground_lose_their_clearance(walk):
+    stance = np.ones((6, 2), bool)
+    stance[1:3, 0] = stance[4, 0] = stance[2:5, 1] = False
+    lift = np.array([[0.0, 0.0], [0.1, 0.0], [0.16, 0.1], [0.0, 0.2], [0.04, 0.1], [0.0, 0.0]])
+    up = lift[..., None] * UP
+    clip = standing(walk, 6)
+    animated = moved(clip, ANKLE, up[:, 0])
+    for joint, leg in ((BALL, 0), (ANKLE, 1), (BALL, 1)):
+        animated = moved(animated, joint, up[:, leg], leg)
+    glued = measure(clip, animated, stance=stance)
+    assert glued.lost_clearance == pytest.approx(0.16)
+    assert glued.worst["lost_clearance"].value == pytest.approx(0.20)
+    higher = measure(clip, animated, gap=lift + 0.05 * ~stance, stance=stance)
+    assert higher.lost_clearance == pytest.approx(-0.05)
+
+
 def test_what_cannot_be_known_is_nan(walk):
     result = measure(standing(walk, 1), gap=np.full((1, 2), np.nan))
     known = {key: getattr(result, key) for key in MEASURES}
