@@ -125,7 +125,9 @@ def scale(v: Float[Array, "*b 3"], factor: Array) -> Float[Array, "*c 3"]:
 def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Square root; 0 with zero gradient where `x` is 0 or negative."""
     positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    # Nearly 0 instead of x: XLA may compute x twice, and round it to either side of 0.
+    least = jnp.finfo(x.dtype).eps ** 2
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, least)), 0.0)
 
 
 def safe_divide(
