@@ -65,8 +65,9 @@ class SlopeTarget(AbstractTarget):
     The ankle goes to `I + u (l + h (1/(n·u) - 1))`, where I is the hit, u up, n the ground's
     normal, h `foot_height` and l the animated lift. This is ozz's construction, a flat sole has its
     ankle `h / (n·u)` above the hit, plus the lift. The height follows the ground with one half-life
-    up and one down, as an exponential or, with `spring` on, as a critically damped spring. The
-    ankle then stays between two heights in model space. Without ground the foothold is that of the
+    up and one down, as an exponential or, with `spring` on, as a critically damped spring. A sole
+    that would be deeper than `max_penetration` in the ground meanwhile is pushed out. The ankle
+    then stays between two heights in model space. Without ground the foothold is that of the
     animation. A limb that bears nothing, such as a hand on a wall, has no animated lift: its sole
     lies on the ground where it stands, and where it does not it stays as animated.
     """
@@ -103,6 +104,13 @@ class SlopeTarget(AbstractTarget):
     )
     follow_slopes: Leaf = switch(
         False, doc="Whether footholds keep up with a slope on which they move, without delay."
+    )
+    max_penetration: Leaf = parameter(
+        float("inf"),
+        unit="m",
+        low=0.0,
+        high=0.2,
+        doc="Depth to which a level sole may be in the ground while its foothold rises to it.",
     )
 
     def init(self, rig: Rig) -> TargetState:
@@ -146,6 +154,12 @@ class SlopeTarget(AbstractTarget):
             dt,
             self.spring,
         )
+        # Animated lift over that of a foot that stands keeps a sole out of the ground as well.
+        lift = foothold.lift if swing_lift is None else foothold.lift - swing_lift
+        over_sole = lift - self.foot_height
+        over_sole = jnp.where(over_sole > 0, over_sole, 0.0)
+        deepest = foothold.height - over_sole - self.max_penetration
+        height = gate.clip(height, deepest, jnp.full_like(height, jnp.inf), band=HEIGHT_BAND)
         rise = height - goal
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)

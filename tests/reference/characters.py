@@ -26,7 +26,7 @@ DEFAULTS = (
     | named("probe", ray_up=0.50, ray_down=0.80, use_toe=True, toe_ls=np.array([0.0, -0.07, 0.20]))
     | named("target", min_ankle_height=-0.30, max_ankle_height=0.55, foot_height=0.08)
     | named("target", max_slope=math.radians(60.0), rise_half_life=0.0, fall_half_life=0.0)
-    | named("target", spring=False, follow_slopes=False)
+    | named("target", spring=False, follow_slopes=False, max_penetration=math.inf)
     | named("lean", forward_rate=-0.30, side_rate=-0.10, gain=0.19, tick_hz=30.0, spring=False)
     | named("lean", forward_rate_slide=0.80, side_rate_slide=0.60, gain_slide=0.294)
     | named("lean", slide_on_gain=0.226, slide_off_gain=0.135)

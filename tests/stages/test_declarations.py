@@ -83,7 +83,7 @@ FootSeparation: distance m 0.1 0 0.3; half_life s 0.04 0.002 0.5
 ContactTarget: foot_height m 0.1 0 0.2
 RootTarget: adjust m 0 -0.1 0.1
 SlopeTarget: min_ankle_height m -0.3 -1 0.5; max_ankle_height m 0.55 0 1.5;
-  foot_height m 0.08 0 0.2; max_slope rad 1.047198 0.1 1.5
+  foot_height m 0.08 0 0.2; max_slope rad 1.047198 0.1 1.5; max_penetration m inf 0 0.2
 SoleTarget: foot_height m 0.12 0 0.2; max_slope rad 1.5 0.1 1.5
 StrideWarp: min_scale 1 0.4 0 1; max_scale 1 1.5 1 2.5; width 1 1 0 1
 """

@@ -137,26 +137,32 @@ def test_feet_cover_a_part_of_their_way_to_their_heights_over_the_body(started, 
 
 
 def test_a_foothold_covers_half_its_way_in_a_half_life_up_and_down():
-    """From 0 to 0.2 m and from 0.3 to 0.1 m; all of it in the first frame."""
+    """From 0 to 0.2 m and from 0.3 to 0.1 m; all of it in the first frame.
+
+    Soles come out of the ground as far as they are deeper than they may be.
+    """
     foothold = fragment(
         Foothold,
         point_ws=jnp.asarray(ZEROS),
         height=jnp.array([0.2, 0.1]),
         ankle_height_ms=jnp.full(2, 0.1),
         climb=jnp.ones(2),
+        lift=jnp.array([0.08, 0.10]),
     )
     level = fragment(GroundHits, ankle=fragment(Hit, normal=jnp.broadcast_to(UP, (2, 3))))
 
     @functools.partial(jax.jit, compiler_options=QUICK)
-    def moved(rise: jax.Array, fall: jax.Array, started: jax.Array) -> jax.Array:
+    def moved(rise: Any, fall: Any, started: Any, deepest: Any) -> jax.Array:
         state = TargetState(jnp.array([0.0, 0.3]), jnp.zeros(2), jnp.asarray(ZEROS))
-        rule = SlopeTarget(rise_half_life=rise, fall_half_life=fall)
+        rule = SlopeTarget(rise_half_life=rise, fall_half_life=fall, max_penetration=deepest)
         return rule.advance(moment(started, foothold=foothold, ground=level), state)[1]
 
     for case, expected in {
-        (DT, DT, True): [-0.1, 0.1],
-        (DT, DT / 2, True): [-0.1, 0.05],
-        (0.5, 0.5, False): [0.0, 0.0],
+        (DT, DT, True, np.inf): [-0.1, 0.1],
+        (DT, DT / 2, True, np.inf): [-0.1, 0.05],
+        (0.5, 0.5, False, np.inf): [0.0, 0.0],
+        (DT, DT, True, 0.03): [-0.03, 0.1],
+        (DT, DT, True, 0.0): [0.0, 0.1],
     }.items():
         np.testing.assert_allclose(moved(*case), expected, rtol=0, atol=1e-12, err_msg=f"{case}")
 

@@ -84,6 +84,7 @@ TARGETS = (
     WALKS("target.fall_half_life", (0.05, 0.2), "+ target height", RAMP_DOWN, NO_LOCK),
     WALKS("target.spring", (False, True), "- target height", RAMP_UP, EASED),
     WALKS("target.follow_slopes", (False, True), "+ target height", RAMP_UP, EASED),
+    WALKS("target.max_penetration", (0.02, 0.0), "+ target height", RAMP_UP, EASED),
 )
 LOCKS = (
     DRIFTS("lock.enabled", (False, True), "- slip"),

@@ -36,7 +36,7 @@ ODD: dict[str, Any] = (  # all parameters away from their defaults
     | named("probe", ray_up=0.4, ray_down=0.42, toe_ls=[0.02, -0.05, 0.18])
     | named("target", min_ankle_height=0.05, max_ankle_height=0.24, foot_height=0.07)
     | named("target", max_slope=0.3, rise_half_life=0.03, fall_half_life=0.06)
-    | named("target", spring=True, follow_slopes=True)
+    | named("target", spring=True, follow_slopes=True, max_penetration=0.01)
     | named("lean", forward_rate=0.5, side_rate=-0.4, gain=0.3, spring=True)
     | named("lean", forward_rate_slide=-0.6, side_rate_slide=0.7, gain_slide=0.5)
     | named("lean", slide_on_gain=0.3, slide_off_gain=0.2)

@@ -179,6 +179,7 @@ def smooth_height(foot: Foot, memory: Followed | None) -> Followed:
     """Smoothed height along up of the foothold and of what the swing adds to the lift, m.
 
     With `follow_slopes` the height first moves as the plane of the ground does under the foothold.
+    A sole whose foot is as animated above its foothold is at most `max_penetration` in the ground.
     """
     foothold, before = float(foot.up @ foot.foothold_ws), None
     goal = foothold + foot.swing_lift
@@ -192,7 +193,11 @@ def smooth_height(foot: Foot, memory: Followed | None) -> Followed:
                 foot, foot.foothold_ws - carried(foot.frame, foot.hit, memory.foothold_ws)
             )
         before = Motion(height, memory.height.velocity)
-    return Followed(ease(foot, "target", before, goal, foot.frame.dt), foot.foothold_ws)
+    height, velocity = ease(foot, "target", before, goal, foot.frame.dt)
+    sole = height + (foot.lift - foot.swing_lift) - foot["target.foot_height"]
+    depth = min(foothold - sole, foothold - height)
+    height += max(depth - foot["target.max_penetration"], 0.0)
+    return Followed(Motion(height, velocity), foot.foothold_ws)
 
 
 def ease(
