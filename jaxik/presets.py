@@ -94,7 +94,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 return_speed=0.6,
             ),
             separation=FootSeparation(),
-            pelvis=LowestPelvis(wait_to_rise=True),
+            pelvis=LowestPelvis(wait_to_rise=True, min_extension=0.36),
             leg=TwoBone(as_animated=True),
             foot=PitchRollFoot(**SLOPES),
         )

@@ -125,3 +125,15 @@ def test_four_legs_lie_along_a_slope_and_two_do_not(preset: str):
         lean = getattr(jaxik.presets, preset)(rig).lean
         rate = float(lean.forward_rate if preset == "record" else lean.pelvis_rate)
         assert (rate == along) if along else rate < 0
+
+
+@pytest.mark.parametrize("preset", ["record", pytest.param("stride", marks=pytest.mark.slow)])
+def test_a_squatter_with_a_foot_on_a_block_puts_it_on_top(preset: str):
+    """The legs fold hardly more than animated, so the body rises with the block."""
+    squat = standing_clip(
+        "block", hip_height=lambda time: 0.90 - 0.48 * np.sin(min(time, 1.0) * np.pi / 2)
+    )
+    heights = ankles(run(preset, squat))[30:, :, 1] - ANKLE
+    left = 0 if heights[0, 0] > heights[0, 1] else 1
+    np.testing.assert_allclose(heights[:, left], 0.12, atol=0.015)
+    np.testing.assert_allclose(heights[:, 1 - left], 0.0, atol=0.015)

@@ -36,7 +36,7 @@ DEFAULTS = (
     | named("lock", release_heading=math.pi, release_speed=math.inf, return_speed=math.inf)
     | named("lock", hold_ball=False)
     | named("pelvis", limit=0.30, on_gain=0.225, off_gain=0.116, tick_hz=30.0)
-    | named("pelvis", vertical_only=True, wait_to_rise=False)
+    | named("pelvis", vertical_only=True, wait_to_rise=False, min_extension=0.0)
     | named("leg", max_knee_angle=math.acos(-0.990), min_knee_angle=math.acos(0.766))
     | named("leg", soften=1.0, twist=0.0, weight=1.0, as_animated=False)
     | named("foot", max_pitch=0.52, min_pitch=-0.79, max_roll=0.26, min_roll=-0.52)

@@ -55,7 +55,8 @@ PlantLock: plant_weight 1 1 0 1; plant_speed 1/s inf 0.1 20; release_distance m 
   release_angle rad 3.141593 0.1 3.141593; release_time s 0.3 0.05 1
 CapsulePelvis: half_height m 0.9 0.3 2
 LegLengthPelvis: min_length m 0.5 0 1; max_length m 0.88 0.2 1.5; speed 1/s 10 0.5 30
-LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95
+LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95;
+  min_extension 1 0 0 0.8
 ReachPelvis: highest_share 1 0.75 0 1.2; extension 1 0.958 0.85 1; softness m 0.025 0.002 0.1;
   shift 1 0.15 0 1
 ReachPelvis SlopeTarget: rise_half_life s 0 0.002 0.5; fall_half_life s 0 0.002 0.5
@@ -98,7 +99,8 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
   SlopeLean;
   OffsetLock hold_ball=yes release_max_angle=3.14159 release_heading=0.5 relock_threshold=0.5
   unlock_half_life=0.05 return_speed=0.6;
-  FootSeparation; LowestPelvis wait_to_rise=yes; DirectEffector; TwoBone as_animated=yes;
+  FootSeparation; LowestPelvis wait_to_rise=yes min_extension=0.36; DirectEffector;
+  TwoBone as_animated=yes;
   PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
   OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade

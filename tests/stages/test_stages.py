@@ -137,6 +137,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         WALKS("pelvis.tick_hz", (30.0, 60.0), "+ pelvis height", RAMP_UP, NO_LOCK),
         Case("pelvis.vertical_only", (False, True), "- pelvis forward", tilted((0.3, 0, -0.2))),
         Case("pelvis.wait_to_rise", (False, True), "- pelvis height", RAMP_DOWN, clip="walks"),
+        Case("pelvis.min_extension", (0.77, 0.8), "+ pelvis height", STEEP),
         Case("leg.max_knee_angle", (2.6, 2.8), "+ knee angle", BELOW, STIFF),
         Case("leg.min_knee_angle", (0.9, 1.2), "+ knee angle", HIGH, STIFF | REACHES_UP),
         Case("leg.soften", (0.85, 0.95), "+ knee angle", BELOW, STIFF),

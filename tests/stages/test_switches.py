@@ -109,6 +109,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.vertical_only", (False, True), "= everything", ANKLE_DEEP),
         STANDING,
         Case("pelvis.wait_to_rise", (False, True), "= everything", ANKLE_DEEP),
+        Case("pelvis.min_extension", (0.0, 0.36), "= everything", ANKLE_DEEP),
         # Along the ray.
         Case("foot.offset[1]", ((0, 0, 0), (0, 0.1, 0)), "= everything", KINK),
     ),

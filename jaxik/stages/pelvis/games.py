@@ -3,9 +3,9 @@
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxik.maths import smoothing
+from jaxik.maths import smoothing, vec
 from jaxik.maths.parameter_tree import (
     Leaf,
     constant,
@@ -13,6 +13,7 @@ from jaxik.maths.parameter_tree import (
     parameter,
     switch,
 )
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Transform
 
 from .base import (
@@ -38,6 +39,9 @@ class LowestPelvis(AbstractPelvis):
 
     Down a slope a walker stands on the foot behind, which is higher, and swings the other towards
     lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then.
+
+    A squatter's leg cannot fold much further. With `min_extension` above 0 the body rises with a
+    standing foot that would fold it more, unless the animation does.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
@@ -56,6 +60,14 @@ class LowestPelvis(AbstractPelvis):
     wait_to_rise: Leaf = switch(
         False, doc="Whether the pelvis rises only as far as feet that swing ask for as well."
     )
+    min_extension: Leaf = parameter(
+        0.0,
+        unit="1",
+        low=0.0,
+        high=0.8,
+        per_leg=True,
+        doc="Part of its length to which a standing leg may be folded; 0 folds it to any.",
+    )
     tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
@@ -70,6 +82,9 @@ class LowestPelvis(AbstractPelvis):
         rise = gate.clip(of_all, zero, zero + jnp.inf, band=HEIGHT_BAND)
         waiting = gate.clip(lowest, zero - jnp.inf, rise, band=HEIGHT_BAND)
         lowest = jnp.where(self.wait_to_rise, waiting, lowest)
+        least = jnp.where(weight > 0, self._least_heights(sensed, target), lowest)
+        unfolded = jnp.where(least > lowest, smoothing.lerp(lowest, least, weight), lowest)
+        lowest = gate.maximum(unfolded, band=HEIGHT_BAND)
         standing = gate.maximum(weight, band=0.1)
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, goal, 0.0)
@@ -82,6 +97,15 @@ class LowestPelvis(AbstractPelvis):
         height = smoothing.lerp(state.height, goal, fraction)
         direction_ws = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
         return PelvisState.at(height, goal, direction_ws)
+
+    def _least_heights(self, sensed: Sensed, target: Transform) -> Float[Array, " legs"]:
+        """The heights of the body up to which each leg is folded too far, m."""
+        animated = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        shortest = self.min_extension * (sensed.thigh + sensed.shin)
+        shortest = jnp.where(animated < shortest, animated, shortest)
+        # A folded leg whose foot is far aside is long enough at any height.
+        least = rise_to_length(sensed, sensed.hip_ws, target.pos, shortest)
+        return jnp.where(self.min_extension > 0, least, -FAR)
 
 
 class CapsulePelvis(AbstractPelvis):

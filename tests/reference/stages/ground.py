@@ -334,5 +334,25 @@ def pelvis_height(
     low = lowest_of(gaps, weights)
     if parameters["pelvis.wait_to_rise"]:
         low = min(low, max(0.0, min(gaps, default=0.0)))
+    low = max([low, *unfolded_heights(parameters, low, feet, targets, up)])
     contact = max(weights, default=0.0)
     return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)
+
+
+def unfolded_heights(
+    parameters: Parameters, low: float, feet: list[Foot], targets: list[Array], up: Array
+) -> list[float]:
+    """Heights of the body, m, that standing feet ask for whose legs would be folded too far."""
+    heights = []
+    for foot, target in zip(feet, targets, strict=True):
+        part, weight = foot["pelvis.min_extension"], foot.grounded * foot.weight
+        if part > 0.0 and weight > 0.0:
+            hip, ankle, knee = (foot.pos_ws(joint) for joint in ("hip", "ankle", "knee"))
+            leg = length(knee - hip) + length(ankle - knee)
+            shortest = min(part * leg, length(ankle - hip))
+            way = target - hip
+            height = float(way @ up)
+            aside_squared = float(way @ way) - height**2
+            least = height + math.sqrt(max(shortest**2 - aside_squared, 0.0))
+            heights.append(lerp(low, max(least, low), weight))
+    return heights
