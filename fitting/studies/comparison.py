@@ -74,7 +74,7 @@ RATES = (
 COLOURS = (*STAGES, CAPTURED)
 Dashes: TypeAlias = Literal["-", "--", ":"]
 DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
-BAR_PANELS = 4  # in a row
+BAR_PANELS = 5  # in a row
 
 RADIUS = 0.018  # m, of the bones of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has
@@ -349,6 +349,8 @@ def overview(comparison: Comparison) -> Figure:
     measured = {name: motion.measures for name, motion in comparison.motions.items()}
     for axes, key in zip(grid.flat, MEASURES, strict=False):
         _bars(axes, key, measured, styles)
+    for unused in grid.flat[len(MEASURES) :]:
+        unused.remove()
     lines = [style.line_key(name, **line) for name, line in styles.items()]
     style.legend(figure, *lines, style.ground_key(), columns=6)
     return figure

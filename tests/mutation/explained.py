@@ -26,7 +26,7 @@ ROUNDING = "a few more or less roundings are as good"
 LOOK = "changes how a picture looks, which the eye judges"
 NO_SIGN = "any negative number lets NumPy work out the length"
 REASONS = {
-    "fitting/studies/calibrate/calibration.py": [("Line2D([], [], color=", "", LOOK)],
+    "fitting/studies/calibrate/calibration.py": [("line_key(", "", LOOK)],
     "fitting/studies/fit/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
     "fitting/studies/population.py": [("columns=5", "columns= 4", LOOK)],
     "fitting/bench/baselines.py": [
