@@ -41,15 +41,6 @@ from fitting.motion.flat_animation import (
     with_cut_off_swings,
     with_remark_if_uneven,
 )
-from fitting.motion.measures import (
-    NOISY,
-    Cause,
-    Measures,
-    PlacedMotion,
-    Soles,
-    likely_cause,
-    place,
-)
 from fitting.motion.playback import stage_outputs
 from fitting.report.formatting import aligned, figures_table, joined
 from fitting.runtime import activity, program_cache
@@ -195,9 +186,13 @@ class Animation:
         """The bounds of its motions, by measure; see `measures.bounds`."""
         animated = self.placed_clip
         bounds = measures.bounds(animated, self._soles(animated))
-        return bounds if self.is_synthetic else {k: v for k, v in bounds.items() if k not in NOISY}
+        return (
+            bounds
+            if self.is_synthetic
+            else {k: v for k, v in bounds.items() if k not in measures.NOISY}
+        )
 
-    def place(self, solved: Clip, result: jaxik.Result | None = None) -> PlacedMotion:
+    def place(self, solved: Clip, result: jaxik.Result | None = None) -> measures.PlacedMotion:
         """A motion on the ground, and what is measured of it.
 
         Args:
@@ -206,18 +201,18 @@ class Animation:
         """
         reached = None if result is None else self.reached(result)
         own = self.own_speed
-        return place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
+        return measures.place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
 
-    def cause(self, motion: PlacedMotion) -> Cause | None:
+    def cause(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """Why the feet of a motion are off their ground; None where they are not."""
         if not motion.measures.misplaced:
             return None
         animated, files = self.placed_clip, self.files
         unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
         soles = self._soles(animated)
-        return likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+        return measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
 
-    def _soles_without(self, cause: Cause) -> Soles | None:
+    def _soles_without(self, cause: measures.Cause) -> measures.Soles | None:
         """The soles of the animation after the remedy for a cause; None where there is none."""
         try:
             if cause.kind == "root" and self.root.rise is None:
@@ -239,7 +234,7 @@ class Animation:
         """
         return at_speed(self.clip, 1.0 / self.speed)
 
-    def _soles(self, solved: Clip) -> Soles:
+    def _soles(self, solved: Clip) -> measures.Soles:
         return measures.soles(solved, self.own_speed, self.terrain, self.floor)
 
 
@@ -408,14 +403,17 @@ def trunk_text(result: jaxik.Result, clip: Clip) -> str:
     return f"{text}; {clip.joint_names[trunk.head]} turns back"
 
 
-def arrays(motion: PlacedMotion) -> dict[str, np.ndarray]:
+def arrays(motion: measures.PlacedMotion) -> dict[str, np.ndarray]:
     """The arrays beside a solved clip in its file: positions by role, and `placement` as JSON."""
     described = np.array(json.dumps(motion.measures.numbers()))
     return positions_by_role(motion.clip) | {"placement": described}
 
 
 def warn(
-    measured: Measures, bounds: Mapping[str, float], cause: Cause | None, name: str = ""
+    measured: measures.Measures,
+    bounds: Mapping[str, float],
+    cause: measures.Cause | None,
+    name: str = "",
 ) -> None:
     """Warns of all that is beyond its bound; see `warning_texts`. The name precedes each text."""
     for text in warning_texts(measured, bounds, cause):
@@ -424,7 +422,7 @@ def warn(
 
 
 def warning_texts(
-    measured: Measures, bounds: Mapping[str, float], cause: Cause | None
+    measured: measures.Measures, bounds: Mapping[str, float], cause: measures.Cause | None
 ) -> list[str]:
     """What is beyond its bound, a sentence for each, the worst first.
 

@@ -10,17 +10,6 @@ from fitting.experiment.experiment import DEFAULT_SIGMAS
 from fitting.inference.identifiability import NORMAL
 from fitting.motion import goodness
 from fitting.motion.evidence import Evidence, describe_missing_motion, find_evidence
-from fitting.motion.goodness import (
-    CLOSE,
-    MOTIONS,
-    NAMES,
-    PART_NAMES,
-    SMALL,
-    Distances,
-    Group,
-    pooled,
-    size,
-)
 from fitting.motion.playback import ClipActivity, Nudge, Playback
 from fitting.motion.worst_window import WorstWindow
 from fitting.problem.space import FreeParameter
@@ -238,7 +227,7 @@ def _describe_sizes(fitted: Fit) -> str:
     )
 
 
-def size_table(groups: Sequence[Group], *, judged: bool = True) -> Table:
+def size_table(groups: Sequence[goodness.Group], *, judged: bool = True) -> Table:
     """The sizes of the residuals, their count and degrees of freedom.
 
     Args:
@@ -255,27 +244,29 @@ def size_table(groups: Sequence[Group], *, judged: bool = True) -> Table:
     return _with_clips(table, groups)
 
 
-def distance_table(distances: Distances) -> Table:
+def distance_table(distances: goodness.Distances) -> Table:
     """How far motions are from the captured one, on fitted frames and on those held out."""
     table = [["distance from the capture, rms", "frames", "flat animation", "before", "fitted"]]
     for part, motions in distances.parts.items():
-        for kind in CLOSE:
-            cells = [size(kind, motions[motion][kind]) for motion in MOTIONS]
-            table.append([NAMES[kind], PART_NAMES[part].removesuffix(" frames"), *cells])
+        for kind in goodness.CLOSE:
+            cells = [goodness.size(kind, motions[motion][kind]) for motion in goodness.MOTIONS]
+            table.append(
+                [goodness.NAMES[kind], goodness.PART_NAMES[part].removesuffix(" frames"), *cells]
+            )
     return table
 
 
-def distances_of_preset(distances: Distances) -> Table:
+def distances_of_preset(distances: goodness.Distances) -> Table:
     """How far a system before any fit is from the captured motion."""
     table = [["distance from the capture, rms", "flat animation", "preset"]]
     motions = distances.parts.get("fitted", {})
-    for kind in CLOSE if motions else ():
-        sizes = [size(kind, motions[motion][kind]) for motion in ("animation", "before")]
-        table.append([NAMES[kind], *sizes])
+    for kind in goodness.CLOSE if motions else ():
+        sizes = [goodness.size(kind, motions[motion][kind]) for motion in ("animation", "before")]
+        table.append([goodness.NAMES[kind], *sizes])
     return table
 
 
-def tolerance_table(groups: Sequence[Group]) -> Table:
+def tolerance_table(groups: Sequence[goodness.Group]) -> Table:
     """The sizes of the errors where there is no noise."""
     table = [["residuals", "active", "tolerance", "error, rms", "error / tolerance"]]
     for group in groups:
@@ -283,7 +274,7 @@ def tolerance_table(groups: Sequence[Group]) -> Table:
     return _with_clips(table, groups)
 
 
-def noise_table(groups: Sequence[Group]) -> Table:
+def noise_table(groups: Sequence[goodness.Group]) -> Table:
     """Whether the residuals look like noise."""
     measured = [group for group in groups if group.is_measured]
     heading = ["residuals", "correlation given", "found", "left", "p", "independent every"]
@@ -299,14 +290,14 @@ def noise_table(groups: Sequence[Group]) -> Table:
     return _with_clips(table, measured)
 
 
-def _sizes(group: Group) -> list[str]:
+def _sizes(group: goodness.Group) -> list[str]:
     """The given sigma, the size of the errors, and their ratio."""
     _, unit, factor = RESIDUALS[group.kind]
     sizes = (group.sigma, group.sigma * group.plain.scale)
     return [*(f"{number(factor * size)} {unit}" for size in sizes), f"{group.plain.scale:.2f}"]
 
 
-def _with_clips(table: Table, groups: Sequence[Group]) -> Table:
+def _with_clips(table: Table, groups: Sequence[goodness.Group]) -> Table:
     """The table with a column for the clip, where there are several."""
     if not any(group.clip for group in groups):
         return table
@@ -315,10 +306,10 @@ def _with_clips(table: Table, groups: Sequence[Group]) -> Table:
     return [["clip", *heading], *([str(group.clip + 1), *row] for group, row in numbered)]
 
 
-def _p(value: float, group: Group) -> str:
+def _p(value: float, group: goodness.Group) -> str:
     if not group.is_measured:
         return "–"
-    return f"< {SMALL:.4f}" if value < SMALL else f"{value:.4f}"
+    return f"< {goodness.SMALL:.4f}" if value < goodness.SMALL else f"{value:.4f}"
 
 
 def noise_blocks(fitted: Fit) -> list[Block]:
@@ -355,7 +346,7 @@ def _estimated_sigmas(fitted: Fit) -> Table:
     for kind, sigma in fitted.noise.sigmas.items():
         name, unit, factor = RESIDUALS[kind]
         assumed = fitted.experiment.sigmas.get(kind, DEFAULT_SIGMAS[kind])
-        degrees = pooled([g.left for g in fitted.groups if g.kind == kind]).degrees
+        degrees = goodness.pooled([g.left for g in fitted.groups if g.kind == kind]).degrees
         spread = math.exp(NORMAL / math.sqrt(2 * max(degrees, 1)))
         ends = interval(factor * sigma / spread, factor * sigma * spread)
         table.append([name, unit, number(factor * assumed), number(factor * sigma), ends])
