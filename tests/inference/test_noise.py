@@ -225,7 +225,10 @@ def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
 
 @pytest.mark.parametrize(
     ("rho", "outliers", "loss", "options"),
-    [(0.95, 0.0, "squares", BOTH), (0.0, 0.03, "student", NoiseOptions("estimated"))],
+    [
+        (0.95, 0.0, "squares", BOTH),
+        pytest.param(0.0, 0.03, "student", NoiseOptions("estimated"), marks=pytest.mark.slow),
+    ],
 )
 def test_intervals_with_estimated_noise_cover_the_truth(no_pipeline, rho, outliers, loss, options):
     """Of four truths and two parameters, assumed with twice their sigmas; 6 of 8 or more have a

@@ -60,7 +60,9 @@ def with_one_a_leg(ik: jaxik.FootIK, *names: str) -> jaxik.FootIK:
 
 BODY = ("root.", "lean.", "pelvis.")
 ONE_FOR_ALL = ("lock.hold_ball", "separation.distance", "effector.latch")
-PER_LEG_IN_THE_PELVIS = ("pelvis.min_length", "pelvis.max_length", "pelvis.extension")
+PER_LEG_IN_THE_PELVIS = (
+    "pelvis.min_length", "pelvis.max_length", "pelvis.extension", "pelvis.min_extension",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("system", SYSTEMS)

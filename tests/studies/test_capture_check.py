@@ -107,6 +107,7 @@ def test_what_a_preset_does_to_flat_clips_is_said_and_what_stops_it_is_free(
     assert "target.foot_height" in free and len(free) <= 5
 
 
+@pytest.mark.slow
 def test_where_nothing_is_free_the_system_is_judged_as_it_comes(tmp_path, capsys):
     path, run = write(tmp_path, clips=HALF_SECOND, free=""), tmp_path / "run"
     assert main.main(["fit", str(path), "-o", str(run)]) == 4
