@@ -74,7 +74,7 @@ RATES = (
 COLOURS = (*STAGES, CAPTURED)
 Dashes: TypeAlias = Literal["-", "--", ":"]
 DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
-BAR_PANELS = 5  # in a row
+BAR_PANELS = 4  # in a row, wide enough for their titles
 
 RADIUS = 0.018  # m, of the bones of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has
@@ -405,7 +405,8 @@ def _bars(
 ) -> None:
     """One measure of all systems, with the value at the end of each bar."""
     values = [getattr(measured, key) for measured in measures.values()]
-    widths = MEASURES[key].factor * np.nan_to_num(values)
+    # No bar for less than nothing, such as a clearance that was gained; its value says so.
+    widths = np.clip(MEASURES[key].factor * np.nan_to_num(values), 0.0, None)
     rows = range(len(values))
     axes.barh(rows, widths, color=[styles[name]["color"] for name in measures], height=0.7)
     for row, width, value in zip(rows, widths, values, strict=True):
@@ -416,7 +417,7 @@ def _bars(
     axes.spines["bottom"].set_visible(False)
     style.name_rows(axes, list(measures))
     axes.grid(False)
-    axes.set_title(MEASURES[key].title.capitalize())
+    axes.set_title(MEASURES[key].title.capitalize(), fontsize="medium")
 
 
 @in_float64
