@@ -107,29 +107,35 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         heights = level.height(line.point)  # (points ends legs)
         firm = line.found * self.trust_from(level.origin_ws, line, up, margin)
 
-        def place(tenths: int) -> tuple[Array, Array, Array]:
-            """What it costs to slide so far, the slide, m, and the share that is supported."""
-            ball = tenths - LINE[0]
-            share, blocked = jnp.zeros_like(heights[0]), jnp.zeros_like(heights[0])
-            climbs = climb(line.normal[ball], vec.scale(ahead, tenth), up)
-            for point in SOLE:
-                above = heights[ball + point] - heights[ball] - climbs * float(point)
-                above *= vec.safe_divide(line.found[ball + point], sole)
-                block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
-                hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
-                share += line.found[ball + point] * (1.0 - block - hollow) / len(SOLE)
-                blocked += block / len(SOLE)
-            slide = tenths * tenth + jnp.zeros_like(share)
-            lack = self.min_sole - firm[ball] * (share - BLOCKS * blocked)
-            cost = jnp.where(lack > 0, lack, 0.0) + SLIDE_COST * 0.1 * abs(tenths - AHEAD)
-            too_far = smoothstep((jnp.abs(slide) - self.max_slide) / (FIFTH * sole))
-            if tenths:
-                too_far = lerp(jnp.ones_like(too_far), too_far, stride.known)
-            return cost + TOO_FAR * too_far, slide, firm[ball] * share
+        # All places in one array: one after another they made the program of `stride` 40 % longer.
+        tenths = np.sort(SLIDES)[:, None, None]
+
+        def at(values: Array, point: int = 0) -> Array:
+            """Values at a point of the sole in each place, (places ends legs)."""
+            first = int(SLIDES.min() - LINE[0]) + point
+            return values[first : first + len(SLIDES)]
+
+        share, blocked = jnp.zeros_like(at(heights)), jnp.zeros_like(at(heights))
+        climbs = climb(at(line.normal), vec.scale(ahead, tenth), up)
+        for point in map(int, SOLE):
+            above = at(heights, point) - at(heights) - climbs * point
+            above *= vec.safe_divide(at(line.found, point), sole)
+            block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
+            hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
+            share += at(line.found, point) * (1.0 - block - hollow) / len(SOLE)
+            blocked += block / len(SOLE)
+        slide = jnp.asarray(tenths, tenth.dtype) * tenth + jnp.zeros_like(share)
+        lack = self.min_sole - at(firm) * (share - BLOCKS * blocked)
+        detour = jnp.asarray(SLIDE_COST * 0.1 * np.abs(tenths - AHEAD), tenth.dtype)
+        too_far = smoothstep((jnp.abs(slide) - self.max_slide) / (FIFTH * sole))
+        too_far = jnp.where(tenths, lerp(jnp.ones_like(too_far), too_far, stride.known), too_far)
+        cost = jnp.where(lack > 0, lack, 0.0) + detour + TOO_FAR * too_far
+        places = cost, slide, at(firm) * share
 
         def cheaper(nearer: tuple[Array, ...], farther: tuple[Array, ...]) -> tuple[Array, ...]:
             stays = gate.below(nearer[0], farther[0], band=SHARE_BAND)
             return tuple(gate.choose(stays, *x) for x in zip(nearer, farther, strict=True))
 
-        _, slide, support = functools.reduce(cheaper, (place(int(x)) for x in SLIDES))
+        nearest_first = [tuple(x[i] for x in places) for i in SLIDES - SLIDES.min()]
+        _, slide, support = functools.reduce(cheaper, nearest_first)
         return vec.scale(ahead, slide), support
