@@ -7,7 +7,7 @@ import re
 import struct
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -121,6 +121,27 @@ def test_the_measures_are_those_of_the_clip_that_run_writes(compared, folder):
         assert record[key] == pytest.approx(placed[key], rel=1e-6), key
     jerk = measures.jerk(solved.positions_ws[:, solved.rig.pelvis, 1], solved.fps)
     assert record["pelvis_jerk"] == pytest.approx(jerk, rel=1e-6)
+
+
+def test_clips_are_played_in_few_lengths_and_get_results_of_their_own(folder, monkeypatch):
+    """Here the result is what goes in: whatever is added comes last and is taken away."""
+    lengths = []
+
+    def play(ik, rig, ground, frames, tracks):
+        lengths.append(len(frames.dt))
+        return frames, tracks
+
+    monkeypatch.setattr(animations.program_cache, "run", play)
+    walk = clips.load_clip(folder / "walk.npz")
+    for count in (20, 60):
+        part = edit.trim(walk, 0.0, count / walk.fps)
+        weights = {"leg.weight": np.linspace(0.0, 1.0, part.frame_count)}
+        animation = Animation(part, terrain.plane(), tracks=weights)
+        result: Any = animation.run(preset_system("record"))
+        frames, tracks = result
+        np.testing.assert_array_equal(frames.pose.ankle.pos, animation.frames.pose.ankle.pos)
+        np.testing.assert_array_equal(tracks["leg.weight"], weights["leg.weight"])
+    assert lengths == [animations.PADDED] * 2
 
 
 def test_a_walk_neither_sinks_nor_floats_on_ground_at_the_height_of_its_floor(folder):
