@@ -161,10 +161,11 @@ class Animation:
         count = len(self.frames.dt)
         repeats = -count % PADDED  # of the last frame, which change nothing before them
 
-        def pad(x: jax.Array | np.ndarray) -> np.ndarray:
+        def pad(x: np.ndarray) -> np.ndarray:
             return np.concatenate([x, np.repeat(x[-1:], repeats, axis=0)])
 
-        frames, tracks = jax.tree.map(pad, (self.frames, dict(self.tracks)))
+        arrays = jax.device_get((self.frames, dict(self.tracks)))
+        frames, tracks = jax.tree.map(pad, arrays)
         result = program_cache.run(ik, self.clip.rig, self.terrain, frames, tracks=tracks or None)
         return jax.tree.map(lambda x: x[:count], jax.device_get(result))
 

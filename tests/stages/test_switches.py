@@ -167,6 +167,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         STANDING,
     ),
 }
+LARGE = "ozz", "mec"  # whose derivatives take long to compile
 # In `test_own_rules`, `test_limits` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
 
@@ -186,14 +187,16 @@ def test_all_numbers_switches_and_masks_of_a_system_have_a_case(preset: str):
 
 @pytest.mark.parametrize("preset", CASES)
 def test_each_leaf_has_the_expected_effect_or_none(preset: str):
-    if preset == "mec":  # whose derivatives are slow
+    if preset in LARGE:
         by_value = cases.outcomes_of(CASES[preset], cases.system(preset), sloped=False)
         assert not by_value.without_effect()
     else:
         assert not outcomes(preset).without_effect()
 
 
-@pytest.mark.parametrize("preset", ["ozz", "unreal", pytest.param("mec", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "preset", ["unreal", *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE)]
+)
 def test_the_derivative_of_each_number_is_its_difference_quotient(preset: str):
     assert not outcomes(preset).with_wrong_slope()
 
