@@ -91,6 +91,8 @@ class Distances:
 
     parts: Mapping[Part, Mapping[Motion, Kinds]]
     """m and rad, of `CLOSE`'s kinds; no part of which no frame was observed."""
+    judged: Sequence[str] = tuple(CLOSE)
+    """Kinds that say whether a fit is good: without those that it was told to ignore."""
 
     @property
     def setbacks(self) -> list[Setback]:
@@ -100,7 +102,7 @@ class Distances:
             for part, motions in self.parts.items()
             for other in ("animation", "before")
             for kind, distance in motions[other].items()
-            if motions["fitted"][kind] > distance + UNSEEN[kind]
+            if kind in self.judged and motions["fitted"][kind] > distance + UNSEEN[kind]
         ]
         return sorted(worse, key=lambda s: (s.distance - s.fitted) / CLOSE[s.kind])
 
@@ -111,7 +113,7 @@ class Distances:
             (part, kind, distance)
             for part, motions in self.parts.items()
             for kind, distance in motions["fitted"].items()
-            if distance > CLOSE[kind]
+            if kind in self.judged and distance > CLOSE[kind]
         ]
 
     @property
@@ -131,13 +133,15 @@ class Distances:
             (distance / CLOSE[kind]) ** 2
             for motions in self.parts.values()
             for kind, distance in motions[motion].items()
+            if kind in self.judged
         )
 
 
 def measure_distances(before: Sequence[Playback], fitted: Sequence[Playback]) -> Distances:
     """The distances of three motions from the captured one, over all clips.
 
-    The clips are those with the system as it was before the fit, and with the fitted one.
+    The clips are those with the system as it was before the fit, and with the fitted one. A kind
+    whose sigma is infinite in all of them is not judged.
     """
     parts: dict[Part, dict[Motion, Kinds]] = {}
     frames: dict[Part, list] = {
@@ -158,7 +162,9 @@ def measure_distances(before: Sequence[Playback], fitted: Sequence[Playback]) ->
                 }
                 for motion, errors in motions.items()
             }
-    return Distances(parts)
+    sigmas = [clip.sigmas for clip in fitted]
+    judged = [kind for kind in CLOSE if any(np.isfinite(each[kind]) for each in sigmas)]
+    return Distances(parts, judged)
 
 
 def _rms(

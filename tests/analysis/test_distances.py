@@ -108,6 +108,18 @@ def test_the_verdict_is_about_what_is_seen(measured, setbacks, better, sentence)
     assert judged.fits == sentence.startswith(("Fits", "Nothing"))
 
 
+def test_what_the_fit_was_told_to_ignore_is_shown_and_not_judged():
+    errors = {kind: np.full((FRAMES, *SHAPES[kind]), 0.001) for kind in CLOSE}
+    errors["foot"] = 200.0 * errors["foot"]
+    near = playback({kind: 0.0 * error for kind, error in errors.items()})
+    fitted = [playback(errors, {"foot": sigma}) for sigma in (0.1, np.inf)]
+    judged, shown = (goodness.measure_distances([near], [clip]) for clip in fitted)
+    assert judged.parts == shown.parts and shown.parts["fitted"]["fitted"]["foot"] > CLOSE["foot"]
+    assert {setback.kind for setback in judged.setbacks} == {"foot"}
+    assert judged.far and judged.better == "before"
+    assert not shown.setbacks and not shown.far and shown.better == "fitted"
+
+
 def test_a_difference_counts_once_it_can_be_seen():
     for kind, unseen in UNSEEN.items():
         for factor, count in ((0.99, 0), (1.01, 1)):
