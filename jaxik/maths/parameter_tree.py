@@ -1,13 +1,14 @@
 """What a rule is made of: parameters that know their meaning, unit and range, and switches.
 
-A stage's rule is a `Rule` whose fields are declared with `parameter`, `constant`, `switch` and
-`layers`. The declaration is the only place where a number's meaning, default, unit and range stand:
-presets, fits, reports and error messages read it from there.
+A stage's rule is a `Rule` whose fields are declared with `parameter` (or, for short, `length`,
+`angle` and so on), `constant`, `switch` and `layers`. The declaration is the only place where a
+number's meaning, default, unit and range stand: presets, fits and reports read it there.
 """
 
 # pyright: reportInvalidTypeVarUse=false
 
 import dataclasses
+import functools
 import inspect
 import operator
 from collections.abc import Iterator, Mapping, Sequence
@@ -132,11 +133,11 @@ def as_layers(x: ArrayLike) -> Array:
 
 def parameter(
     default: float | tuple[float, ...],
-    *,
-    unit: str,
     low: float,
     high: float,
     doc: str,
+    *,
+    unit: str,
     kind: ParameterKind = "smooth",
     scale: Scale = "linear",
     above: str | None = None,
@@ -145,12 +146,15 @@ def parameter(
 ) -> Declared:
     """Declares a float field of a rule: one number for all legs, or one a leg.
 
+    `length`, `angle`, `speed`, `duration`, `rate` and `ratio` are this with their unit, and
+    `threshold` is one that moves a hard decision.
+
     Args:
         default: its value in a rule made without it.
-        unit: such as "m", "rad" or "1/s"; "1" for a plain number.
         low: a fit goes no lower.
         high: a fit goes no higher.
         doc: one sentence, for users, that says what the parameter does.
+        unit: such as "m", "rad" or "1/s"; "1" for a plain number.
         kind: "threshold" if it moves a hard decision, so that its derivative there is zero.
         scale: how a fit steps: "linear", by factors ("log"), or as the half-life of a "gain".
         above: the field of the same rule that it stays above, if any.
@@ -159,6 +163,7 @@ def parameter(
         per_leg: whether it may be one number a leg; None leaves that to the rule's `per_leg`, which
             is False in stages that move the whole body.
     """
+    low, high = float(low), float(high)
     follows = BY_UNIT.get(unit, "nothing") if follows is None else follows
     declaration = Declaration(unit, low, high, kind, scale, above, doc, follows)
     metadata = {"declaration": declaration, "unit": unit, "doc": doc, "per_leg": per_leg}
@@ -166,28 +171,37 @@ def parameter(
     return _field(default, as_float_array, metadata)
 
 
-def half_life_parameter(default: float, *, doc: str) -> Declared:
+length = functools.partial(parameter, unit="m")
+angle = functools.partial(parameter, unit="rad")
+speed = functools.partial(parameter, unit="m/s")
+duration = functools.partial(parameter, unit="s")
+rate = functools.partial(parameter, unit="1/s", scale="log")
+ratio = functools.partial(parameter, unit="1")
+threshold = functools.partial(parameter, kind="threshold")
+
+
+def half_life(default: float, doc: str) -> Declared:
     """Declares a half-life, s: fitted by factors from 2 ms to 0.5 s; at 0 memory jumps."""
-    return parameter(default, unit="s", low=0.002, high=0.5, scale="log", doc=doc)
+    return parameter(default, 0.002, 0.5, doc, unit="s", scale="log")
 
 
-def gain_parameter(default: float, *, doc: str) -> Declared:
+def gain_per_tick(default: float, doc: str) -> Declared:
     """Declares a gain per tick, 0..1: fitted as its half-life; at 1 memory jumps."""
-    return parameter(default, unit="1/tick", low=0.01, high=0.95, scale="gain", doc=doc)
+    return parameter(default, 0.01, 0.95, doc, unit="1/tick", scale="gain")
 
 
-def constant(default: float, *, unit: str, doc: str) -> Declared:
+def constant(default: float, doc: str, *, unit: str) -> Declared:
     """Declares a float field of a rule that is a convention, such as a tick rate: never fitted."""
     metadata = {"unit": unit, "doc": doc, "follows": BY_UNIT.get(unit, "nothing")}
     return _field(default, as_float_array, metadata)
 
 
-def switch(default: bool, *, doc: str, per_leg: bool | None = None) -> Declared:
+def switch(default: bool, doc: str, *, per_leg: bool | None = None) -> Declared:
     """Declares a boolean field of a rule; for `per_leg` see `parameter`."""
     return _field(default, as_switch, {"doc": doc, "per_leg": per_leg})
 
 
-def option(default: bool, *, doc: str) -> Declared:
+def option(default: bool, doc: str) -> Declared:
     """Declares what is switched when a program is compiled, not while it runs."""
     return eqx.field(default=default, static=True, kw_only=True, metadata={"doc": doc})
 

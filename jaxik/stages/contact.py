@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life, length, threshold
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact
 from jaxik.world.skeleton import Rig
@@ -49,27 +49,23 @@ class HeightContact(AbstractInstantContact):
     A limb that bears nothing, such as a hand on a wall, stands at any height.
     """
 
-    ground_height: Leaf = parameter(
-        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
-    )
-    planted_height: Leaf = parameter(
-        0.10,
+    ground_height: Leaf = length(0, -0.5, 0.5, "Height of the animation's floor in model space.")
+    planted_height: Leaf = threshold(
+        0.1,
+        0,
+        0.4,
+        "Ankle height over the floor below which a foot counts as planted.",
         unit="m",
         follows="over ankle height",
-        low=0.0,
-        high=0.4,
-        kind="threshold",
-        doc="Ankle height over the floor below which a foot counts as planted.",
     )
-    raised_height: Leaf = parameter(
+    raised_height: Leaf = threshold(
         0.16,
+        0,
+        0.6,
+        "Ankle height over the floor above which a foot counts as lifted.",
         unit="m",
         follows="over ankle height",
-        low=0.0,
-        high=0.6,
-        kind="threshold",
         above="planted_height",
-        doc="Ankle height over the floor above which a foot counts as lifted.",
     )
 
     def sense(self, inputs: Inputs) -> Contact:
@@ -102,13 +98,8 @@ class StandingContact(AbstractInstantContact):
 class IdleContact(AbstractInstantContact):
     """All feet stand while the character stands still, none while it moves (Unreal)."""
 
-    idle_speed: Leaf = parameter(
-        0.0,
-        unit="m/s",
-        low=0.0,
-        high=3.0,
-        kind="threshold",
-        doc="Speed of the character up to which it counts as standing still.",
+    idle_speed: Leaf = threshold(
+        0, 0, 3, "Speed of the character up to which it counts as standing still.", unit="m/s"
     )
 
     def sense(self, inputs: Inputs) -> Contact:
@@ -121,9 +112,7 @@ class IdleContact(AbstractInstantContact):
 class LabelContact(AbstractInstantContact):
     """Contact from the labels that come with the animation (`Stride.standing`)."""
 
-    ground_height: Leaf = parameter(
-        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
-    )
+    ground_height: Leaf = length(0, -0.5, 0.5, "Height of the animation's floor in model space.")
 
     def sense(self, inputs: Inputs) -> Contact:
         standing = inputs.frame.stride.standing
@@ -152,47 +141,37 @@ class SpeedContact(AbstractContact):
     slow.
     """
 
-    ground_height: Leaf = parameter(
-        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
-    )
-    planted_height: Leaf = parameter(
+    ground_height: Leaf = length(0, -0.5, 0.5, "Height of the animation's floor in model space.")
+    planted_height: Leaf = threshold(
         0.075,
+        0,
+        0.4,
+        "A swinging foot can plant once its ball is below this height.",
         unit="m",
         follows="over ball height",
-        low=0.0,
-        high=0.4,
-        kind="threshold",
-        doc="A swinging foot can plant once its ball is below this height.",
     )
-    raised_height: Leaf = parameter(
-        0.10,
+    raised_height: Leaf = threshold(
+        0.1,
+        0,
+        0.6,
+        "A planted foot lifts once its ball is above this height.",
         unit="m",
         follows="over ball height",
-        low=0.0,
-        high=0.6,
-        kind="threshold",
         above="planted_height",
-        doc="A planted foot lifts once its ball is above this height.",
     )
-    planted_speed: Leaf = parameter(
-        0.25,
-        unit="m/s",
-        low=0.0,
-        high=1.5,
-        kind="threshold",
-        doc="A swinging foot can plant once its ball is slower than this.",
+    planted_speed: Leaf = threshold(
+        0.25, 0, 1.5, "A swinging foot can plant once its ball is slower than this.", unit="m/s"
     )
-    raised_speed: Leaf = parameter(
-        0.50,
+    raised_speed: Leaf = threshold(
+        0.5,
+        0,
+        3,
+        "A planted foot lifts once its ball is faster than this.",
         unit="m/s",
-        low=0.0,
-        high=3.0,
-        kind="threshold",
         above="planted_speed",
-        doc="A planted foot lifts once its ball is faster than this.",
     )
-    half_life: Leaf = half_life_parameter(
-        0.0, doc="Time in which the contact weight covers half its way after a change."
+    half_life: Leaf = half_life(
+        0, "Time in which the contact weight covers half its way after a change."
     )
 
     def init(self, rig: Rig) -> SpeedState:

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    angle,
+    duration,
+    rate,
+    ratio,
+    switch,
+    threshold,
+)
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Sensed, counted
 from jaxik.world.skeleton import Rig, Transform
@@ -37,7 +46,7 @@ class Effector:
 
 def _contact_switch() -> Any:
     doc = "Whether a foot gets as much foot IK as its contact, so that it swings as animated."
-    return switch(False, doc=doc)
+    return switch(False, doc)
 
 
 class AbstractEffector(Rule):
@@ -112,16 +121,10 @@ class HeelEffector(AbstractInstantEffector):
     little.
     """
 
-    extension: Leaf = parameter(
-        0.98,
-        unit="1",
-        low=0.8,
-        high=1.0,
-        doc="Part of its length to which a leg stretches before the heel rises.",
+    extension: Leaf = ratio(
+        0.98, 0.8, 1, "Part of its length to which a leg stretches before the heel rises."
     )
-    max_lift: Leaf = parameter(
-        0.60, unit="rad", low=0.0, high=1.2, doc="Largest angle by which the heel is lifted."
-    )
+    max_lift: Leaf = angle(0.6, 0, 1.2, "Largest angle by which the heel is lifted.")
 
     by_contact: Leaf = _contact_switch()
 
@@ -213,26 +216,14 @@ class BodyEffector(AbstractEffector):
     heights are in metres of the world, whatever the scale of the mesh, so there is none.
     """
 
-    speed: Leaf = parameter(
-        15.0,
-        unit="1/s",
-        low=0.5,
-        high=30.0,
-        scale="log",
-        doc="Rate at which feet follow their heights relative to the body.",
-    )
+    speed: Leaf = rate(15, 0.5, 30, "Rate at which feet follow their heights relative to the body.")
     latch: Leaf = switch(
         False,
-        doc="Whether everything stops once the feet have arrived, until the character moves.",
+        "Whether everything stops once the feet have arrived, until the character moves.",
         per_leg=False,
     )
-    latch_distance: Leaf = parameter(
-        0.01,
-        unit="m",
-        low=0.0,
-        high=0.05,
-        kind="threshold",
-        doc="Distance from its goal within which a foot counts as arrived.",
+    latch_distance: Leaf = threshold(
+        0.01, 0, 0.05, "Distance from its goal within which a foot counts as arrived.", unit="m"
     )
 
     by_contact: Leaf = _contact_switch()
@@ -291,9 +282,7 @@ class FadeEffector(AbstractEffector):
     last ground gave it.
     """
 
-    transition_time: Leaf = parameter(
-        0.20, unit="s", low=0.0, high=1.0, doc="Time in which foot IK of a leg fades in or out."
-    )
+    transition_time: Leaf = duration(0.2, 0, 1, "Time in which foot IK of a leg fades in or out.")
 
     by_contact: Leaf = _contact_switch()
 

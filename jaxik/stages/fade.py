@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import HARD
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, speed
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform, mean_position
@@ -126,13 +126,12 @@ class SpeedFade(AbstractFade):
     instead of waiting for the fade.
     """
 
-    speed: Leaf = parameter(
+    speed: Leaf = speed(
         0.5,
-        unit="m/s",
-        low=0.1,
-        high=3.0,
+        0.1,
+        3,
+        "Speed by which joints move at most while foot IK fades in or out.",
         scale="log",
-        doc="Speed by which joints move at most while foot IK fades in or out.",
     )
 
     def init(self, rig: Rig) -> SpeedFadeState:

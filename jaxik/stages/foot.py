@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, angle, length, ratio, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
 from jaxik.solvers.pole import PoleTarget
@@ -79,33 +79,20 @@ class PitchRollFoot(AbstractAnimatedFoot):
     beyond its limits stays as it is.
     """
 
-    max_pitch: Leaf = parameter(
-        0.52,
-        unit="rad",
-        low=0.0,
-        high=1.4,
-        doc="Largest pitch against the shin, toes up, to which the ground turns a foot.",
+    max_pitch: Leaf = angle(
+        0.52, 0, 1.4, "Largest pitch against the shin, toes up, to which the ground turns a foot."
     )
-    min_pitch: Leaf = parameter(
-        -0.79,
-        unit="rad",
-        low=-1.4,
-        high=0.0,
-        doc="Largest pitch against the shin, toes down, as a negative angle.",
+    min_pitch: Leaf = angle(
+        -0.79, -1.4, 0, "Largest pitch against the shin, toes down, as a negative angle."
     )
-    max_roll: Leaf = parameter(
+    max_roll: Leaf = angle(
         0.26,
-        unit="rad",
-        low=0.0,
-        high=1.0,
-        doc="Largest roll against the shin, outer edge up, to which the ground turns a foot.",
+        0,
+        1,
+        "Largest roll against the shin, outer edge up, to which the ground turns a foot.",
     )
-    min_roll: Leaf = parameter(
-        -0.52,
-        unit="rad",
-        low=-1.0,
-        high=0.0,
-        doc="Largest roll against the shin, outer edge down, as a negative angle.",
+    min_roll: Leaf = angle(
+        -0.52, -1, 0, "Largest roll against the shin, outer edge down, as a negative angle."
     )
 
     def pose(
@@ -147,20 +134,12 @@ class AimFoot(AbstractAnimatedFoot):
     foot that the solved leg gives it.
     """
 
-    enabled: Leaf = switch(True, doc="Whether feet are turned to the ground.")
-    offset: Leaf = parameter(
-        (0.0, 0.0, 0.0),
-        unit="m",
-        low=-0.2,
-        high=0.2,
-        doc="Where the axis out of the sole starts, from the ankle, in foot axes.",
+    enabled: Leaf = switch(True, "Whether feet are turned to the ground.")
+    offset: Leaf = length(
+        (0, 0, 0), -0.2, 0.2, "Where the axis out of the sole starts, from the ankle, in foot axes."
     )
-    twist: Leaf = parameter(
-        0.0, unit="rad", low=-1.0, high=1.0, doc="Turn of the foot about its aim."
-    )
-    weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How far feet are turned to the ground, 0 to 1."
-    )
+    twist: Leaf = angle(0, -1, 1, "Turn of the foot about its aim.")
+    weight: Leaf = ratio(1, 0, 1, "How far feet are turned to the ground, 0 to 1.")
 
     def pose(
         self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
@@ -188,9 +167,7 @@ class FlatFoot(AbstractFoot):
     missed. Both tilt a level foot, together by at most `max_tilt`.
     """
 
-    max_tilt: Leaf = parameter(
-        0.7853981634, unit="rad", low=0.0, high=1.5, doc="Largest angle by which a foot is tilted."
-    )
+    max_tilt: Leaf = angle(0.7853981634, 0, 1.5, "Largest angle by which a foot is tilted.")
 
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
         up_ws = inputs.terrain.leg_up_ws

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import Declared, Leaf, Rule, angle, length, ratio, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.pole import PoleTarget, bend_to_pole
 from jaxik.solvers.reach import LENGTH_BAND, soft_limit, third_side
@@ -64,17 +64,17 @@ class AbstractLeg(Rule):
 
 def _soften_parameter(default: float, low: float) -> Declared:
     doc = "Part of its reach beyond which a leg slows down instead of snapping straight."
-    return parameter(default, unit="1", low=low, high=1.0, doc=doc)
+    return ratio(default, low, 1, doc)
 
 
 def _twist_parameter() -> Declared:
     doc = "Turn of the leg about the line from hip to target."
-    return parameter(0.0, unit="rad", low=-1.0, high=1.0, doc=doc)
+    return angle(0, -1, 1, doc)
 
 
 def _weight_parameter() -> Declared:
     doc = "How much of foot IK each leg takes, 0 to 1."
-    return parameter(1.0, unit="1", low=0.0, high=1.0, doc=doc)
+    return ratio(1, 0, 1, doc)
 
 
 class TwoBone(AbstractLeg):
@@ -91,19 +91,13 @@ class TwoBone(AbstractLeg):
     leg with a bone of no length, or along its hinge, does not bend.
     """
 
-    max_knee_angle: Leaf = parameter(
-        3.0000531803,
-        unit="rad",
-        low=2.0,
-        high=3.1415926536,
-        doc="Largest interior angle of the knee; pi is a straight leg.",
+    max_knee_angle: Leaf = angle(
+        3.0000531803, 2, 3.1415926536, "Largest interior angle of the knee; pi is a straight leg."
     )
-    min_knee_angle: Leaf = parameter(
-        0.6982008392, unit="rad", low=0.0, high=1.8, doc="Smallest interior angle of the knee."
-    )
+    min_knee_angle: Leaf = angle(0.6982008392, 0, 1.8, "Smallest interior angle of the knee.")
     soften: Leaf = _soften_parameter(0.98, low=0.8)
     as_animated: Leaf = switch(
-        False, doc="Whether a leg may stay as straight or bent as animated, beyond the limits."
+        False, "Whether a leg may stay as straight or bent as animated, beyond the limits."
     )
     twist: Leaf = _twist_parameter()
     weight: Leaf = _weight_parameter()
@@ -154,7 +148,7 @@ class PoleLeg(AbstractLeg):
     points along the bone and whose z axis is the hinge. With `enabled` off legs move with the body.
     """
 
-    enabled: Leaf = switch(True, doc="Whether legs are solved.")
+    enabled: Leaf = switch(True, "Whether legs are solved.")
     soften: Leaf = _soften_parameter(1.0, low=0.1)
     twist: Leaf = _twist_parameter()
     weight: Leaf = _weight_parameter()
@@ -173,12 +167,11 @@ class HintLeg(AbstractLeg):
     `hint_offset` in character axes (x left, y up, z forward).
     """
 
-    hint_offset: Leaf = parameter(
-        (0.0, 0.0, 0.0),
-        unit="m",
-        low=-0.5,
-        high=0.5,
-        doc="Offset of the knee's aim in character axes (x left, y up, z forward).",
+    hint_offset: Leaf = length(
+        (0, 0, 0),
+        -0.5,
+        0.5,
+        "Offset of the knee's aim in character axes (x left, y up, z forward).",
     )
     soften: Leaf = _soften_parameter(1.0, low=0.1)
     twist: Leaf = _twist_parameter()

@@ -1,6 +1,7 @@
 """Stage 2: the height of the whole character."""
 
 from abc import abstractmethod
+from math import inf
 from typing import ClassVar
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import parameter_tree, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life, speed, switch, threshold
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import rise_of
 from jaxik.world.skeleton import Rig
@@ -109,41 +110,26 @@ class GroundRoot(AbstractRoot):
     game has it as it was.
     """
 
-    enabled: Leaf = switch(True, doc="Whether the character is placed on the ground.")
-    ray_up: Leaf = parameter(
-        10.0,
-        unit="m",
-        low=0.0,
-        high=20.0,
-        kind="threshold",
-        doc="Height above the character's origin at which the rays start.",
+    enabled: Leaf = switch(True, "Whether the character is placed on the ground.")
+    ray_up: Leaf = threshold(
+        10, 0, 20, "Height above the character's origin at which the rays start.", unit="m"
     )
-    ray_down: Leaf = parameter(
-        float("inf"),
-        unit="m",
-        low=0.0,
-        high=20.0,
-        kind="threshold",
-        doc="Depth below the character's origin to which the rays look.",
+    ray_down: Leaf = threshold(
+        inf, 0, 20, "Depth below the character's origin to which the rays look.", unit="m"
     )
     layers: Leaf = parameter_tree.layers()
-    half_life: Leaf = half_life_parameter(
-        0.20, doc="Time in which the character covers half its way to the height of the ground."
+    half_life: Leaf = half_life(
+        0.2, "Time in which the character covers half its way to the height of the ground."
     )
-    max_speed: Leaf = parameter(
-        4.0,
-        unit="m/s",
-        low=0.5,
-        high=10.0,
-        doc="Fastest that the character rises or sinks over the ground that carries it.",
+    max_speed: Leaf = speed(
+        4, 0.5, 10, "Fastest that the character rises or sinks over the ground that carries it."
     )
-    max_step: Leaf = parameter(
-        0.40,
+    max_step: Leaf = threshold(
+        0.4,
+        0.1,
+        1,
+        "Step beyond which ground ahead does not count yet and ground above may be a roof.",
         unit="m",
-        low=0.1,
-        high=1.0,
-        kind="threshold",
-        doc="Step beyond which ground ahead does not count yet and ground above may be a roof.",
     )
 
     def init(self, rig: Rig) -> RootState:

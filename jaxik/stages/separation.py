@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life, length
 from jaxik.maths.struct import struct
 from jaxik.world.skeleton import Rig
 
@@ -73,17 +73,14 @@ class FootSeparation(AbstractSeparation):
     on a slope it follows the ground. Feet in the middle of a body do not take part.
     """
 
-    distance: Leaf = parameter(
-        0.10,
-        unit="m",
-        low=0.0,
-        high=0.3,
+    distance: Leaf = length(
+        0.1,
+        0,
+        0.3,
+        "Distance sideways between the ankles of opposite feet below which they give way.",
         per_leg=False,
-        doc="Distance sideways between the ankles of opposite feet below which they give way.",
     )
-    half_life: Leaf = half_life_parameter(
-        0.04, doc="Time in which a swinging foot covers half its way aside."
-    )
+    half_life: Leaf = half_life(0.04, "Time in which a swinging foot covers half its way aside.")
 
     def init(self, rig: Rig) -> SeparationState:
         return SeparationState(jnp.zeros_like(rig.knee_axis_ls))

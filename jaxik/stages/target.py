@@ -1,6 +1,7 @@
 """Stage 5: the foothold of each foot, with the height of the ground smoothed over time."""
 
 from abc import abstractmethod
+from math import inf
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, angle, half_life, length, switch
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Contact, Foothold, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
@@ -72,45 +73,34 @@ class SlopeTarget(AbstractTarget):
     lies on the ground where it stands, and where it does not it stays as animated.
     """
 
-    min_ankle_height: Leaf = parameter(
-        -0.30, unit="m", low=-1.0, high=0.5, doc="Lowest height of the ankle in model space."
+    min_ankle_height: Leaf = length(-0.3, -1, 0.5, "Lowest height of the ankle in model space.")
+    max_ankle_height: Leaf = length(0.55, 0, 1.5, "Highest height of the ankle in model space.")
+    foot_height: Leaf = length(
+        0.08, 0, 0.2, "Height of the ankle above the sole.", follows="ankle height"
     )
-    max_ankle_height: Leaf = parameter(
-        0.55, unit="m", low=0.0, high=1.5, doc="Highest height of the ankle in model space."
-    )
-    foot_height: Leaf = parameter(
-        0.08,
-        unit="m",
-        follows="ankle height",
-        low=0.0,
-        high=0.2,
-        doc="Height of the ankle above the sole.",
-    )
-    max_slope: Leaf = parameter(
+    max_slope: Leaf = angle(
         1.0471975512,
-        unit="rad",
-        low=0.1,
-        high=1.5,
-        doc="Steepest slope that is compensated; steeper ground counts as this steep.",
+        0.1,
+        1.5,
+        "Steepest slope that is compensated; steeper ground counts as this steep.",
     )
-    rise_half_life: Leaf = half_life_parameter(
-        0.0, doc="Time in which a foothold covers half its way up to higher ground."
+    rise_half_life: Leaf = half_life(
+        0, "Time in which a foothold covers half its way up to higher ground."
     )
-    fall_half_life: Leaf = half_life_parameter(
-        0.0, doc="Time in which a foothold covers half its way down to lower ground."
+    fall_half_life: Leaf = half_life(
+        0, "Time in which a foothold covers half its way down to lower ground."
     )
     spring: Leaf = switch(
-        False, doc="Whether footholds follow the ground as a critically damped spring."
+        False, "Whether footholds follow the ground as a critically damped spring."
     )
     follow_slopes: Leaf = switch(
-        False, doc="Whether footholds keep up with a slope on which they move, without delay."
+        False, "Whether footholds keep up with a slope on which they move, without delay."
     )
-    max_penetration: Leaf = parameter(
-        float("inf"),
-        unit="m",
-        low=0.0,
-        high=0.2,
-        doc="Depth to which a level sole may be in the ground while its foothold rises to it.",
+    max_penetration: Leaf = length(
+        inf,
+        0,
+        0.2,
+        "Depth to which a level sole may be in the ground while its foothold rises to it.",
     )
 
     def init(self, rig: Rig) -> TargetState:
@@ -183,20 +173,11 @@ class SoleTarget(AbstractInstantTarget):
     that of the animation.
     """
 
-    foot_height: Leaf = parameter(
-        0.12,
-        unit="m",
-        follows="ankle height",
-        low=0.0,
-        high=0.2,
-        doc="Height of the ankle above the sole.",
+    foot_height: Leaf = length(
+        0.12, 0, 0.2, "Height of the ankle above the sole.", follows="ankle height"
     )
-    max_slope: Leaf = parameter(
-        1.5,
-        unit="rad",
-        low=0.1,
-        high=1.5,
-        doc="Steepest slope that is compensated; steeper ground counts as this steep.",
+    max_slope: Leaf = angle(
+        1.5, 0.1, 1.5, "Steepest slope that is compensated; steeper ground counts as this steep."
     )
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
@@ -214,13 +195,8 @@ class ContactTarget(AbstractInstantTarget):
     Without ground the foothold is that of the animation.
     """
 
-    foot_height: Leaf = parameter(
-        0.10,
-        unit="m",
-        follows="ankle height",
-        low=0.0,
-        high=0.2,
-        doc="Height of the ankle above the ground, on slopes too.",
+    foot_height: Leaf = length(
+        0.1, 0, 0.2, "Height of the ankle above the ground, on slopes too.", follows="ankle height"
     )
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
@@ -240,9 +216,7 @@ class RootTarget(AbstractInstantTarget):
     a hand on a wall, stands with its sole on the ground.
     """
 
-    adjust: Leaf = parameter(
-        0.0, unit="m", low=-0.1, high=0.1, doc="Height added to every foot that stands."
-    )
+    adjust: Leaf = length(0, -0.1, 0.1, "Height added to every foot that stands.")
 
     @property
     def foot_height(self) -> Array:

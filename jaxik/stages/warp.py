@@ -5,7 +5,7 @@ from abc import abstractmethod
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, ratio
 from jaxik.world.frame import heading
 
 from .inputs import Inputs
@@ -44,19 +44,9 @@ class StrideWarp(AbstractWarp):
     far as longer strides need them to.
     """
 
-    min_scale: Leaf = parameter(
-        0.4, unit="1", low=0.0, high=1.0, doc="Shortest strides, as a part of the animated ones."
-    )
-    max_scale: Leaf = parameter(
-        1.5, unit="1", low=1.0, high=2.5, doc="Longest strides, as a multiple of the animated ones."
-    )
-    width: Leaf = parameter(
-        1.0,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="How much the width of steps is scaled with their length.",
-    )
+    min_scale: Leaf = ratio(0.4, 0, 1, "Shortest strides, as a part of the animated ones.")
+    max_scale: Leaf = ratio(1.5, 1, 2.5, "Longest strides, as a multiple of the animated ones.")
+    width: Leaf = ratio(1, 0, 1, "How much the width of steps is scaled with their length.")
 
     def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
         frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws

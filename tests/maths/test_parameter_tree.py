@@ -16,7 +16,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxik.maths import parameter_tree
-from jaxik.maths.parameter_tree import Leaf, Rule, gain_parameter, half_life_parameter, parameter
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    angle,
+    gain_per_tick,
+    half_life,
+    length,
+    parameter,
+    speed,
+    threshold,
+)
 from jaxik.maths.struct import struct
 from jaxik.world.skeleton import Transform
 
@@ -66,21 +76,19 @@ HIGH = "Height above which the foot is lifted."
 
 
 class Lift(Rule):
-    height: Leaf = parameter(0.1, unit="m", low=0.0, high=0.5, doc="Height of the foot.")
-    top: Leaf = parameter(
-        (0.2, 0.3), unit="m", low=0.0, high=1.0, kind="threshold", above="height", doc=HIGH
-    )
-    gain: Leaf = gain_parameter(0.5, doc="Part of the gap closed in each tick.")
-    half_life: Leaf = half_life_parameter(0.1, doc="Time in which half of the gap closes.")
-    tick_hz: Leaf = parameter_tree.constant(30.0, unit="Hz", doc="Ticks per second.")
-    early: Leaf = parameter_tree.switch(True, doc="Whether the foot is lifted early.")
+    height: Leaf = length(0.1, 0, 0.5, "Height of the foot.")
+    top: Leaf = threshold((0.2, 0.3), 0, 1, HIGH, unit="m", above="height")
+    gain: Leaf = gain_per_tick(0.5, "Part of the gap closed in each tick.")
+    half_life: Leaf = half_life(0.1, "Time in which half of the gap closes.")
+    tick_hz: Leaf = parameter_tree.constant(30, "Ticks per second.", unit="Hz")
+    early: Leaf = parameter_tree.switch(True, "Whether the foot is lifted early.")
     layers: Leaf = parameter_tree.layers()
 
 
 class Walk(Rule):
     lift: Lift = eqx.field(default_factory=Lift)
-    max_angle: Leaf = parameter(0.5, unit="rad", low=0.0, high=3.0, doc="Largest angle.")
-    speed: Leaf = parameter(1.4, unit="m/s", low=0.0, high=3.0, doc="Speed of the walk.")
+    max_angle: Leaf = angle(0.5, 0, 3, "Largest angle.")
+    speed: Leaf = speed(1.4, 0, 3, "Speed of the walk.")
 
 
 def test_parameters_and_constants_become_floats_and_switches_booleans():
@@ -136,7 +144,7 @@ def test_everything_declared_has_a_sentence_of_meaning():
     assert docs["lift.early"] == "Whether the foot is lifted early."
     assert list(docs)[-3:] == ["lift.layers", "max_angle", "speed"] and len(docs) == 9
     with pytest.raises(TypeError, match="doc"):
-        parameter(0.1, unit="m", low=0.0, high=0.5)  # pyright: ignore[reportCallIssue]
+        parameter(0.1, 0, 0.5, unit="m")  # pyright: ignore[reportCallIssue]
     # So that `help` lists them.
     described = "Attributes:\n    height: Height of the foot. Unit m. Range 0 to 0.5.\n"
     assert described in str(Lift.__doc__)

@@ -1,6 +1,7 @@
 """Transforms, skeletons, and bodies of other sizes: their numbers, and similar motion."""
 
 import dataclasses
+from math import inf
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +17,18 @@ from fitting.clips import edit, load_clip
 from fitting.clips.clip_frames import frames_from_clip
 from jaxik import presets
 from jaxik.maths import parameter_tree
-from jaxik.maths.parameter_tree import Leaf, Rule, constant, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    angle,
+    constant,
+    duration,
+    half_life,
+    length,
+    parameter,
+    speed,
+    switch,
+)
 from jaxik.pipeline.shapes import check_system
 from jaxik.stages.contact import HeightContact, SpeedContact
 from jaxik.world import body, skeleton, terrain
@@ -159,18 +171,16 @@ SIZE = 1.3
 class Kick(Rule):
     """A rule of a user's own."""
 
-    reach: Leaf = parameter((0.1, 0.2), unit="m", low=0.0, high=1.0, doc="How far it goes.")
-    speed: Leaf = parameter(1.0, unit="m/s", low=0.0, high=4.0, doc="How fast it is.")
-    pull: Leaf = parameter(8.0, unit="m/s²", low=0.0, high=20.0, doc="How hard it pulls.")
-    pause: Leaf = parameter(1.0, unit="s", low=0.0, high=4.0, follows="time", doc="How long.")
-    height: Leaf = parameter(
-        0.115, unit="m", low=0.0, high=0.4, follows="over ankle height", doc="How high it is."
-    )
-    free: Leaf = parameter(float("inf"), unit="m", low=0.0, high=1.0, doc="How far it may go.")
-    angle: Leaf = parameter(1.0, unit="rad", low=0.0, high=2.0, doc="How far it turns.")
-    half_life: Leaf = half_life_parameter(0.1, doc="How smooth it is.")
-    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second.")
-    on: Leaf = switch(True, doc="Whether it does anything.")
+    reach: Leaf = length((0.1, 0.2), 0, 1, "How far it goes.")
+    speed: Leaf = speed(1, 0, 4, "How fast it is.")
+    pull: Leaf = parameter(8, 0, 20, "How hard it pulls.", unit="m/s²")
+    pause: Leaf = duration(1, 0, 4, "How long.", follows="time")
+    height: Leaf = length(0.115, 0, 0.4, "How high it is.", follows="over ankle height")
+    free: Leaf = length(inf, 0, 1, "How far it may go.")
+    angle: Leaf = angle(1, 0, 2, "How far it turns.")
+    half_life: Leaf = half_life(0.1, "How smooth it is.")
+    tick_hz: Leaf = constant(30, "Ticks per second.", unit="Hz")
+    on: Leaf = switch(True, "Whether it does anything.")
 
 
 def make_body(

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import quat, smoothing
-from jaxik.maths.parameter_tree import Leaf, constant, gain_parameter, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, constant, gain_per_tick, ratio, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.world.frame import Contact, GroundHits, Slope
 from jaxik.world.skeleton import Rig
@@ -29,48 +29,36 @@ class SlopeLean(AbstractLean):
     with `spring` on by a critically damped spring with the half-lives of the same gains.
     """
 
-    forward_rate: Leaf = parameter(
-        -0.30,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean forward per slope ahead; 1 is square to the ground, below 0 into the hill.",
+    forward_rate: Leaf = ratio(
+        -0.3,
+        -1,
+        1,
+        "Lean forward per slope ahead; 1 is square to the ground, below 0 into the hill.",
     )
-    side_rate: Leaf = parameter(
-        -0.10,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean sideways per slope aside; 1 is square to the ground, below 0 into the hill.",
+    side_rate: Leaf = ratio(
+        -0.1,
+        -1,
+        1,
+        "Lean sideways per slope aside; 1 is square to the ground, below 0 into the hill.",
     )
-    forward_rate_slide: Leaf = parameter(
-        0.80,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean forward per slope ahead while the character slides.",
+    forward_rate_slide: Leaf = ratio(
+        0.8, -1, 1, "Lean forward per slope ahead while the character slides."
     )
-    side_rate_slide: Leaf = parameter(
-        0.60,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean sideways per slope aside while the character slides.",
+    side_rate_slide: Leaf = ratio(
+        0.6, -1, 1, "Lean sideways per slope aside while the character slides."
     )
-    gain: Leaf = gain_parameter(
-        0.19, doc="Part of the gap that the smoothed slope closes in each tick."
+    gain: Leaf = gain_per_tick(0.19, "Part of the gap that the smoothed slope closes in each tick.")
+    gain_slide: Leaf = gain_per_tick(
+        0.294, "Part of the gap that the smoothed slope closes in each tick of a slide."
     )
-    gain_slide: Leaf = gain_parameter(
-        0.294, doc="Part of the gap that the smoothed slope closes in each tick of a slide."
+    slide_on_gain: Leaf = gain_per_tick(
+        0.226, "Part of the way into sliding rates covered in each tick as a slide begins."
     )
-    slide_on_gain: Leaf = gain_parameter(
-        0.226, doc="Part of the way into sliding rates covered in each tick as a slide begins."
+    slide_off_gain: Leaf = gain_per_tick(
+        0.135, "Part of the way out of sliding rates covered in each tick as a slide ends."
     )
-    slide_off_gain: Leaf = gain_parameter(
-        0.135, doc="Part of the way out of sliding rates covered in each tick as a slide ends."
-    )
-    spring: Leaf = switch(False, doc="Whether the slope is smoothed by a critically damped spring.")
-    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
+    spring: Leaf = switch(False, "Whether the slope is smoothed by a critically damped spring.")
+    tick_hz: Leaf = constant(30, "Ticks per second that the gains refer to.", unit="Hz")
 
     def init(self, rig: Rig) -> LeanState:
         return LeanState.level(rig)

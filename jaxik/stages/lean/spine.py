@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, half_life, length, ratio, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.world.frame import Contact, GroundHits, Slope, counted
 from jaxik.world.skeleton import Rig
@@ -48,74 +48,47 @@ class SpineLean(AbstractLean):
     (`tests/phase_pelvis`). Its roll it does not explain.
     """
 
-    uphill_rate: Leaf = parameter(
+    uphill_rate: Leaf = ratio(
         -0.65,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean of the trunk per slope where the ground rises ahead; below 0 into the hill.",
+        -1,
+        1,
+        "Lean of the trunk per slope where the ground rises ahead; below 0 into the hill.",
     )
-    downhill_rate: Leaf = parameter(
+    downhill_rate: Leaf = ratio(
         -0.25,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean of the trunk per slope where the ground falls ahead; below 0 into the hill.",
+        -1,
+        1,
+        "Lean of the trunk per slope where the ground falls ahead; below 0 into the hill.",
     )
-    side_rate: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean of the trunk sideways per slope aside; below 0 into the hill.",
+    side_rate: Leaf = ratio(
+        0, -1, 1, "Lean of the trunk sideways per slope aside; below 0 into the hill."
     )
-    forward_rate_slide: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean of the trunk per slope ahead while the character slides.",
+    forward_rate_slide: Leaf = ratio(
+        0, -1, 1, "Lean of the trunk per slope ahead while the character slides."
     )
-    side_rate_slide: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Lean of the trunk sideways per slope aside while the character slides.",
+    side_rate_slide: Leaf = ratio(
+        0, -1, 1, "Lean of the trunk sideways per slope aside while the character slides."
     )
-    head_share: Leaf = parameter(
-        0.5,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Part of the lean of the trunk that the head turns back; 1 keeps the gaze level.",
+    head_share: Leaf = ratio(
+        0.5, 0, 1, "Part of the lean of the trunk that the head turns back; 1 keeps the gaze level."
     )
-    pelvis_rate: Leaf = parameter(
-        -0.25,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Tilt of the pelvis forward per slope ahead; below 0 into the hill.",
+    pelvis_rate: Leaf = ratio(
+        -0.25, -1, 1, "Tilt of the pelvis forward per slope ahead; below 0 into the hill."
     )
-    pelvis_side_rate: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=-1.0,
-        high=1.0,
-        doc="Tilt of the pelvis sideways per slope aside; below 0 into the hill.",
+    pelvis_side_rate: Leaf = ratio(
+        0, -1, 1, "Tilt of the pelvis sideways per slope aside; below 0 into the hill."
     )
-    spacing: Leaf = parameter(
-        0.30,
-        unit="m",
-        low=0.05,
-        high=2.0,
+    spacing: Leaf = length(
+        0.3,
+        0.05,
+        2,
+        "Distance between feet at which the slope between them counts as that of their soles.",
         scale="log",
-        doc="Distance between feet at which the slope between them counts as that of their soles.",
     )
-    half_life: Leaf = half_life_parameter(
-        0.2, doc="Time in which the lean covers half its way to that of a new slope."
+    half_life: Leaf = half_life(
+        0.2, "Time in which the lean covers half its way to that of a new slope."
     )
-    spring: Leaf = switch(False, doc="Whether the slope is smoothed by a critically damped spring.")
+    spring: Leaf = switch(False, "Whether the slope is smoothed by a critically damped spring.")
 
     def init(self, rig: Rig) -> LeanState:
         return LeanState.level(rig)

@@ -1,10 +1,18 @@
 """The lock of the record: an offset that cancels the motion of a standing foot."""
 
+from math import inf
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    half_life,
+    speed,
+    switch,
+    threshold,
+)
 from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.frame import Sensed
@@ -63,88 +71,62 @@ class OffsetLock(AbstractLock):
     A released foot can lock again once `factor` has decayed to `relock_threshold`.
     """
 
-    enabled: Leaf = switch(True, doc="Whether planted feet are locked in place.")
+    enabled: Leaf = switch(True, "Whether planted feet are locked in place.")
     hold_ball: Leaf = switch(
         False,
-        doc="Whether a lock holds ball and heading, so that the heel can rise, or only the ankle.",
+        "Whether a lock holds ball and heading, so that the heel can rise, or only the ankle.",
         per_leg=False,
     )
-    release_min_angle: Leaf = parameter(
-        0.8726646260,
+    release_min_angle: Leaf = threshold(
+        0.872664626,
+        0,
+        1.8,
+        "A lock lets go if it would bend the knee below this interior angle.",
         unit="rad",
-        low=0.0,
-        high=1.8,
-        kind="threshold",
-        doc="A lock lets go if it would bend the knee below this interior angle.",
     )
-    release_max_angle: Leaf = parameter(
+    release_max_angle: Leaf = threshold(
         3.0019663134,
-        unit="rad",
-        low=2.0,
-        high=3.1415926536,
-        kind="threshold",
-        doc="A lock lets go if it would open the knee beyond this interior angle.",
-    )
-    release_cone: Leaf = parameter(
-        0.4363323130,
-        unit="rad",
-        low=0.0,
-        high=1.5,
-        kind="threshold",
-        doc="A lock lets go if the leg would leave its animated direction by this angle.",
-    )
-    release_distance: Leaf = parameter(
-        0.20,
-        unit="m",
-        low=0.0,
-        high=0.5,
-        kind="threshold",
-        doc="A lock lets go if the foot would be this far from its foothold.",
-    )
-    release_heading: Leaf = parameter(
+        2,
         3.1415926536,
+        "A lock lets go if it would open the knee beyond this interior angle.",
         unit="rad",
-        low=0.1,
-        high=3.1415926536,
-        kind="threshold",
-        doc="A lock lets go if the animated foot points away by this angle.",
     )
-    release_speed: Leaf = parameter(
-        float("inf"),
-        unit="m/s",
-        low=0.0,
-        high=3.0,
-        kind="threshold",
-        doc="A lock lets go if the foot would otherwise move faster than this.",
+    release_cone: Leaf = threshold(
+        0.436332313,
+        0,
+        1.5,
+        "A lock lets go if the leg would leave its animated direction by this angle.",
+        unit="rad",
     )
-    relock_threshold: Leaf = parameter(
-        0.20,
+    release_distance: Leaf = threshold(
+        0.2, 0, 0.5, "A lock lets go if the foot would be this far from its foothold.", unit="m"
+    )
+    release_heading: Leaf = threshold(
+        3.1415926536,
+        0.1,
+        3.1415926536,
+        "A lock lets go if the animated foot points away by this angle.",
+        unit="rad",
+    )
+    release_speed: Leaf = threshold(
+        inf, 0, 3, "A lock lets go if the foot would otherwise move faster than this.", unit="m/s"
+    )
+    relock_threshold: Leaf = threshold(
+        0.2,
+        0,
+        1,
+        "A released foot can lock again once its lock has faded to this weight.",
         unit="1",
-        low=0.0,
-        high=1.0,
-        kind="threshold",
-        doc="A released foot can lock again once its lock has faded to this weight.",
     )
-    max_speed: Leaf = parameter(
-        float("inf"),
-        unit="m/s",
-        low=0.0,
-        high=3.0,
-        kind="threshold",
-        doc="A foot locks only while it is slower than this.",
+    max_speed: Leaf = threshold(
+        inf, 0, 3, "A foot locks only while it is slower than this.", unit="m/s"
     )
-    lock_half_life: Leaf = half_life_parameter(
-        0.05, doc="Time in which a new lock reaches half its hold."
+    lock_half_life: Leaf = half_life(0.05, "Time in which a new lock reaches half its hold.")
+    unlock_half_life: Leaf = half_life(
+        0.1, "Time in which a released foot covers half its way back to the foothold."
     )
-    unlock_half_life: Leaf = half_life_parameter(
-        0.10, doc="Time in which a released foot covers half its way back to the foothold."
-    )
-    return_speed: Leaf = parameter(
-        float("inf"),
-        unit="m/s",
-        low=0.1,
-        high=3.0,
-        doc="Highest speed at which a released foot goes back to its foothold.",
+    return_speed: Leaf = speed(
+        inf, 0.1, 3, "Highest speed at which a released foot goes back to its foothold."
     )
 
     def init(self, rig: Rig) -> LockState:

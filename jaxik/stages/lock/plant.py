@@ -1,10 +1,12 @@
 """The lock of Mec: a foot stays where it first found ground."""
 
+from math import inf
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, duration, rate, ratio, switch, threshold
 from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.skeleton import Rig
@@ -50,38 +52,23 @@ class PlantLock(AbstractLock):
     the original, nothing but a lost ground lets go of a foot.
     """
 
-    plant: Leaf = switch(True, doc="Whether a foot stays where it first stood on ground.")
-    plant_weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How much a planted foot keeps its place, 0 to 1."
-    )
-    plant_speed: Leaf = parameter(
-        float("inf"),
-        unit="1/s",
-        low=0.1,
-        high=20.0,
-        scale="log",
-        doc="Rate at which planting moves to its weight; infinite sets it at once.",
+    plant: Leaf = switch(True, "Whether a foot stays where it first stood on ground.")
+    plant_weight: Leaf = ratio(1, 0, 1, "How much a planted foot keeps its place, 0 to 1.")
+    plant_speed: Leaf = rate(
+        inf, 0.1, 20, "Rate at which planting moves to its weight; infinite sets it at once."
     )
 
-    release_distance: Leaf = parameter(
-        float("inf"),
-        unit="m",
-        low=0.0,
-        high=0.5,
-        kind="threshold",
-        doc="A planted foot is let go if its foothold would be this far from it.",
+    release_distance: Leaf = threshold(
+        inf, 0, 0.5, "A planted foot is let go if its foothold would be this far from it.", unit="m"
     )
-    release_angle: Leaf = parameter(
+    release_angle: Leaf = threshold(
         3.1415926536,
+        0.1,
+        3.1415926536,
+        "A planted foot is let go if it would be turned away from it by this angle.",
         unit="rad",
-        low=0.1,
-        high=3.1415926536,
-        kind="threshold",
-        doc="A planted foot is let go if it would be turned away from it by this angle.",
     )
-    release_time: Leaf = parameter(
-        0.30, unit="s", low=0.05, high=1.0, doc="Time in which a foot that is let go is free."
-    )
+    release_time: Leaf = duration(0.3, 0.05, 1, "Time in which a foot that is let go is free.")
 
     def init(self, rig: Rig) -> PlantState:
         zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)

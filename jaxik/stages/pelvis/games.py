@@ -6,13 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import (
-    Leaf,
-    constant,
-    gain_parameter,
-    parameter,
-    switch,
-)
+from jaxik.maths.parameter_tree import Leaf, constant, gain_per_tick, length, rate, ratio, switch
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Transform
 
@@ -44,31 +38,28 @@ class LowestPelvis(AbstractPelvis):
     standing foot that would fold it more, unless the animation does.
     """
 
-    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
-    limit: Leaf = parameter(
-        0.30, unit="m", low=0.0, high=0.6, doc="Furthest that the pelvis moves up or down."
+    enabled: Leaf = switch(True, "Whether the pelvis moves.")
+    limit: Leaf = length(0.3, 0, 0.6, "Furthest that the pelvis moves up or down.")
+    on_gain: Leaf = gain_per_tick(
+        0.225, "Part of the gap that the pelvis closes in each tick while a foot stands."
     )
-    on_gain: Leaf = gain_parameter(
-        0.225, doc="Part of the gap that the pelvis closes in each tick while a foot stands."
-    )
-    off_gain: Leaf = gain_parameter(
-        0.116, doc="Part of the gap that the pelvis closes in each tick while no foot stands."
+    off_gain: Leaf = gain_per_tick(
+        0.116, "Part of the gap that the pelvis closes in each tick while no foot stands."
     )
     vertical_only: Leaf = switch(
-        True, doc="Whether the pelvis moves along up, or along the ground's normal."
+        True, "Whether the pelvis moves along up, or along the ground's normal."
     )
     wait_to_rise: Leaf = switch(
-        False, doc="Whether the pelvis rises only as far as feet that swing ask for as well."
+        False, "Whether the pelvis rises only as far as feet that swing ask for as well."
     )
-    min_extension: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=0.0,
-        high=0.8,
+    min_extension: Leaf = ratio(
+        0,
+        0,
+        0.8,
+        "Part of its length to which a standing leg may be folded; 0 folds it to any.",
         per_leg=True,
-        doc="Part of its length to which a standing leg may be folded; 0 folds it to any.",
     )
-    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
+    tick_hz: Leaf = constant(30, "Ticks per second that the gains refer to.", unit="Hz")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -116,18 +107,9 @@ class CapsulePelvis(AbstractPelvis):
     of Unreal's interp-to. With `enabled` off both go back.
     """
 
-    enabled: Leaf = switch(True, doc="Whether the pelvis sinks.")
-    speed: Leaf = parameter(
-        15.0,
-        unit="1/s",
-        low=0.5,
-        high=30.0,
-        scale="log",
-        doc="Rate at which pelvis and capsule follow their goals.",
-    )
-    half_height: Leaf = parameter(
-        0.90, unit="m", low=0.3, high=2.0, doc="Half the height of the character's capsule at rest."
-    )
+    enabled: Leaf = switch(True, "Whether the pelvis sinks.")
+    speed: Leaf = rate(15, 0.5, 30, "Rate at which pelvis and capsule follow their goals.")
+    half_height: Leaf = length(0.9, 0.3, 2, "Half the height of the character's capsule at rest.")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -160,35 +142,22 @@ class LegLengthPelvis(AbstractPelvis):
     leaves a body alone that stands on flat ground.
     """
 
-    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
-    min_length: Leaf = parameter(
-        0.50,
-        unit="m",
-        low=0.0,
-        high=1.0,
-        per_leg=True,
-        doc="Shortest distance from hip to ankle that the pelvis allows.",
+    enabled: Leaf = switch(True, "Whether the pelvis moves.")
+    min_length: Leaf = length(
+        0.5, 0, 1, "Shortest distance from hip to ankle that the pelvis allows.", per_leg=True
     )
-    max_length: Leaf = parameter(
+    max_length: Leaf = length(
         0.88,
-        unit="m",
-        low=0.2,
-        high=1.5,
+        0.2,
+        1.5,
+        "Longest distance from hip to ankle that the pelvis allows.",
         above="min_length",
         per_leg=True,
-        doc="Longest distance from hip to ankle that the pelvis allows.",
     )
     damp: Leaf = switch(
-        True, doc="Whether the pelvis follows its goal smoothly; if not, it jumps there."
+        True, "Whether the pelvis follows its goal smoothly; if not, it jumps there."
     )
-    speed: Leaf = parameter(
-        10.0,
-        unit="1/s",
-        low=0.5,
-        high=30.0,
-        scale="log",
-        doc="Rate at which the pelvis follows its goal.",
-    )
+    speed: Leaf = rate(10, 0.5, 30, "Rate at which the pelvis follows its goal.")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate

@@ -9,12 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import (
-    Leaf,
-    half_life_parameter,
-    parameter,
-    switch,
-)
+from jaxik.maths.parameter_tree import Leaf, half_life, length, ratio, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import counted
 from jaxik.world.skeleton import Transform, mean_position
@@ -94,20 +89,12 @@ class SupportPelvis(AbstractFollowingPelvis):
     pelvis rules that do not consider reach it comes nearest to captured people on uneven blocks.
     """
 
-    lowest_share: Leaf = parameter(
-        0.30,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Weight of the lowest foot against the mean of those that stand, 0 to 1.",
+    lowest_share: Leaf = ratio(
+        0.3, 0, 1, "Weight of the lowest foot against the mean of those that stand, 0 to 1."
     )
-    rise_half_life: Leaf = half_life_parameter(
-        0.10, doc="Time in which the pelvis covers half its way up."
-    )
-    fall_half_life: Leaf = half_life_parameter(
-        0.10, doc="Time in which the pelvis covers half its way down."
-    )
-    spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
+    rise_half_life: Leaf = half_life(0.1, "Time in which the pelvis covers half its way up.")
+    fall_half_life: Leaf = half_life(0.1, "Time in which the pelvis covers half its way down.")
+    spring: Leaf = switch(False, "Whether the pelvis moves as a critically damped spring.")
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
@@ -139,43 +126,28 @@ class ReachPelvis(AbstractFollowingPelvis):
     ground explains nothing of where it is.
     """
 
-    highest_share: Leaf = parameter(
-        0.75,
-        unit="1",
-        low=0.0,
-        high=1.2,
-        doc="Weight of the highest foot against the mean of all, 0 to 1.",
+    highest_share: Leaf = ratio(
+        0.75, 0, 1.2, "Weight of the highest foot against the mean of all, 0 to 1."
     )
-    extension: Leaf = parameter(
-        0.958,
-        unit="1",
-        low=0.85,
-        high=1.0,
-        per_leg=True,
-        doc="Part of its length to which a leg may be stretched.",
+    extension: Leaf = ratio(
+        0.958, 0.85, 1, "Part of its length to which a leg may be stretched.", per_leg=True
     )
-    softness: Leaf = parameter(
+    softness: Leaf = length(
         0.025,
-        unit="m",
-        low=0.002,
-        high=0.1,
+        0.002,
+        0.1,
+        "Height over which the limits of the legs blend into each other.",
         scale="log",
-        doc="Height over which the limits of the legs blend into each other.",
     )
-    shift: Leaf = parameter(
+    shift: Leaf = ratio(
         0.15,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Part of the way to the foot whose leg limits it that the pelvis moves ahead or back.",
+        0,
+        1,
+        "Part of the way to the foot whose leg limits it that the pelvis moves ahead or back.",
     )
-    rise_half_life: Leaf = half_life_parameter(
-        0.0, doc="Time in which the pelvis covers half its way up."
-    )
-    fall_half_life: Leaf = half_life_parameter(
-        0.0, doc="Time in which the pelvis covers half its way down."
-    )
-    spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
+    rise_half_life: Leaf = half_life(0, "Time in which the pelvis covers half its way up.")
+    fall_half_life: Leaf = half_life(0, "Time in which the pelvis covers half its way down.")
+    spring: Leaf = switch(False, "Whether the pelvis moves as a critically damped spring.")
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.parameter_tree import Leaf, length, threshold
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, animated_ankles
 from jaxik.world.sweep import sweep, sweepable
@@ -27,29 +27,15 @@ class SweepProbe(AbstractLimitedProbe):
     `jaxik.world.sweep.sweepable`, which experiments and commands see to (`prepare`).
     """
 
-    ray_up: Leaf = parameter(
-        0.50,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Height above the ankle at which the underside of the capsule starts.",
+    ray_up: Leaf = threshold(
+        0.5, 0, 2, "Height above the ankle at which the underside of the capsule starts.", unit="m"
     )
-    ray_down: Leaf = parameter(
-        0.80,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Depth below the ankle to which the capsule comes down.",
+    ray_down: Leaf = threshold(
+        0.8, 0, 2, "Depth below the ankle to which the capsule comes down.", unit="m"
     )
-    radius: Leaf = parameter(0.04, unit="m", low=0.01, high=0.1, doc="Radius of the capsule.")
-    toe_length: Leaf = parameter(
-        0.15, unit="m", low=0.0, high=0.25, doc="Distance forward from the ankle to its front end."
-    )
-    heel_length: Leaf = parameter(
-        0.03, unit="m", low=0.0, high=0.15, doc="Distance backward from the ankle to its back end."
-    )
+    radius: Leaf = length(0.04, 0.01, 0.1, "Radius of the capsule.")
+    toe_length: Leaf = length(0.15, 0, 0.25, "Distance forward from the ankle to its front end.")
+    heel_length: Leaf = length(0.03, 0, 0.15, "Distance backward from the ankle to its back end.")
     layers: Leaf = parameter_tree.layers()
 
     def prepare(self, terrain: Ground) -> Ground:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, length, switch, threshold
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, animated_ankles
@@ -31,31 +31,20 @@ MARGIN = 0.1  # m that rays are cast too far, so that a softened reach has groun
 class FootProbe(AbstractLimitedProbe):
     """One ray at the ankle and, with `use_toe`, one at the toe (the record; ozz has no toe ray)."""
 
-    ray_up: Leaf = parameter(
-        0.50,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Height above ankle and toe at which the rays start.",
+    ray_up: Leaf = threshold(
+        0.5, 0, 2, "Height above ankle and toe at which the rays start.", unit="m"
     )
-    ray_down: Leaf = parameter(
-        0.80,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Depth below ankle and toe to which the rays look.",
+    ray_down: Leaf = threshold(
+        0.8, 0, 2, "Depth below ankle and toe to which the rays look.", unit="m"
     )
-    toe_ls: Leaf = parameter(
-        (0.0, -0.07, 0.20),
-        unit="m",
-        low=-0.4,
-        high=0.4,
-        doc="Toe of a left foot from its ankle, in foot axes (x left, y up, z forward).",
+    toe_ls: Leaf = length(
+        (0, -0.07, 0.2),
+        -0.4,
+        0.4,
+        "Toe of a left foot from its ankle, in foot axes (x left, y up, z forward).",
     )
     use_toe: Leaf = switch(
-        True, doc="Whether a second ray, at the toe, measures the pitch of the ground."
+        True, "Whether a second ray, at the toe, measures the pitch of the ground."
     )
     layers: Leaf = parameter_tree.layers()
 
@@ -81,21 +70,15 @@ class RootProbe(AbstractLimitedProbe):
     (the half-height) above the root, and ends `ray_down` (the trace distance) below the root.
     """
 
-    ray_up: Leaf = parameter(
-        0.90,
+    ray_up: Leaf = threshold(
+        0.9,
+        0,
+        2,
+        "Height above the character's origin at which rays start: its capsule's centre.",
         unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Height above the character's origin at which rays start: its capsule's centre.",
     )
-    ray_down: Leaf = parameter(
-        0.50,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Depth below the character's origin to which rays look.",
+    ray_down: Leaf = threshold(
+        0.5, 0, 2, "Depth below the character's origin to which rays look.", unit="m"
     )
     layers: Leaf = parameter_tree.layers()
 
@@ -118,72 +101,39 @@ class CornerProbe(AbstractLimitedProbe):
     `extra_min` for others.
     """
 
-    active: Leaf = switch(
-        True, doc="Whether the leg looks for ground; if not, it stays as animated."
+    active: Leaf = switch(True, "Whether the leg looks for ground; if not, it stays as animated.")
+    ray_up: Leaf = threshold(0.5, 0, 2, "Height above the foot at which rays start.", unit="m")
+    foot_length: Leaf = length(0.2, 0.02, 0.5, "Distance forward from the foot to the toe's ray.")
+    half_width: Leaf = length(
+        0.05, 0.01, 0.2, "Distance to the right from the foot to the corner's ray."
     )
-    ray_up: Leaf = parameter(
-        0.50,
+    extra: Leaf = threshold(
+        0.2,
+        0,
+        1,
+        "How far rays look below the sole where neither height nor speed sets it.",
         unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Height above the foot at which rays start.",
-    )
-    foot_length: Leaf = parameter(
-        0.20, unit="m", low=0.02, high=0.5, doc="Distance forward from the foot to the toe's ray."
-    )
-    half_width: Leaf = parameter(
-        0.05,
-        unit="m",
-        low=0.01,
-        high=0.2,
-        doc="Distance to the right from the foot to the corner's ray.",
-    )
-    extra: Leaf = parameter(
-        0.20,
-        unit="m",
-        low=0.0,
-        high=1.0,
-        kind="threshold",
-        doc="How far rays look below the sole where neither height nor speed sets it.",
     )
     by_height: Leaf = switch(
-        True, doc="Whether rays look deeper below a foot that is low over the root."
+        True, "Whether rays look deeper below a foot that is low over the root."
     )
-    by_speed: Leaf = switch(False, doc="Whether rays look deeper below a foot that is slow.")
-    extra_min: Leaf = parameter(
-        0.0,
-        unit="m",
-        low=0.0,
-        high=1.0,
-        kind="threshold",
-        doc="How far rays look below the sole of an unstable foot.",
+    by_speed: Leaf = switch(False, "Whether rays look deeper below a foot that is slow.")
+    extra_min: Leaf = threshold(
+        0, 0, 1, "How far rays look below the sole of an unstable foot.", unit="m"
     )
-    extra_max: Leaf = parameter(
-        0.30,
-        unit="m",
-        low=0.0,
-        high=1.0,
-        kind="threshold",
-        above="extra_min",
-        doc="How far rays look below the sole of a stable foot.",
+    extra_max: Leaf = threshold(
+        0.3, 0, 1, "How far rays look below the sole of a stable foot.", unit="m", above="extra_min"
     )
-    stable_height: Leaf = parameter(
+    stable_height: Leaf = threshold(
         0.12,
+        0,
+        0.5,
+        "Height over the root below which a foot counts as stable.",
         unit="m",
         follows="over ankle height",
-        low=0.0,
-        high=0.5,
-        kind="threshold",
-        doc="Height over the root below which a foot counts as stable.",
     )
-    stable_speed: Leaf = parameter(
-        0.50,
-        unit="m/s",
-        low=0.0,
-        high=3.0,
-        kind="threshold",
-        doc="Speed below which a foot counts as stable.",
+    stable_speed: Leaf = threshold(
+        0.5, 0, 3, "Speed below which a foot counts as stable.", unit="m/s"
     )
     layers: Leaf = parameter_tree.layers()
 

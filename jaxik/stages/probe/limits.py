@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, constant, option, parameter
+from jaxik.maths.parameter_tree import Leaf, angle, constant, length, option, ratio
 from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
@@ -40,49 +40,30 @@ class AbstractLimitedProbe(AbstractProbe):
     falls from 1 to 0.
     """
 
-    max_step_up: Leaf = parameter(
-        0.30,
-        unit="m",
-        low=0.1,
-        high=1.0,
-        doc="Height of a step up, not of a slope, above which ground is refused.",
+    max_step_up: Leaf = length(
+        0.3, 0.1, 1, "Height of a step up, not of a slope, above which ground is refused."
     )
-    max_step_down: Leaf = parameter(
-        0.40,
-        unit="m",
-        low=0.1,
-        high=1.0,
-        doc="Height of a step down, not of a slope, above which ground is refused.",
+    max_step_down: Leaf = length(
+        0.4, 0.1, 1, "Height of a step down, not of a slope, above which ground is refused."
     )
-    max_slope: Leaf = parameter(
-        0.785,
-        unit="rad",
-        low=0.1,
-        high=1.5,
-        doc="Slope of the ground above which it is refused.",
-    )
+    max_slope: Leaf = angle(0.785, 0.1, 1.5, "Slope of the ground above which it is refused.")
     step_fade: Leaf = constant(
-        0.10, unit="m", doc="Height over which a step becomes too high or too low."
+        0.1, "Height over which a step becomes too high or too low.", unit="m"
     )
-    min_support: Leaf = parameter(
-        0.5,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Share of the ground around a foothold that must go on; with less it is refused.",
+    min_support: Leaf = ratio(
+        0.5, 0, 1, "Share of the ground around a foothold that must go on; with less it is refused."
     )
-    support_radius: Leaf = parameter(
+    support_radius: Leaf = length(
         0.04,
-        unit="m",
-        low=0.01,
-        high=0.15,
-        doc="Distance from a foothold at which ground must go on: half the width of a sole.",
+        0.01,
+        0.15,
+        "Distance from a foothold at which ground must go on: half the width of a sole.",
     )
     limited: bool = option(
-        True, doc="Whether any ground is refused; without limits no ray is cast for them."
+        True, "Whether any ground is refused; without limits no ray is cast for them."
     )
     check_support: bool = option(
-        False, doc="Whether narrow ground is refused, which takes nine times as many rays."
+        False, "Whether narrow ground is refused, which takes nine times as many rays."
     )
 
     def cast(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, option, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, duration, option, ratio, switch, threshold
 from jaxik.maths.smoothing import clip_to_one, lerp, smoothstep
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
@@ -58,67 +58,46 @@ class StrideProbe(AbstractSupportedProbe):
     is a part.
     """
 
-    ray_up: Leaf = parameter(
-        1.0,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Height above the character's level at which rays start.",
+    ray_up: Leaf = threshold(
+        1, 0, 2, "Height above the character's level at which rays start.", unit="m"
     )
-    ray_down: Leaf = parameter(
-        1.0,
-        unit="m",
-        low=0.0,
-        high=2.0,
-        kind="threshold",
-        doc="Depth below the character's level to which rays look.",
+    ray_down: Leaf = threshold(
+        1, 0, 2, "Depth below the character's level to which rays look.", unit="m"
     )
     use_strides: Leaf = switch(
-        True, doc="Whether the animation's footholds are used; off, they are predicted."
+        True, "Whether the animation's footholds are used; off, they are predicted."
     )
-    rise_start: Leaf = parameter(
-        0.0,
-        unit="1",
-        low=0.0,
-        high=0.45,
-        doc="Part of the swing after which the foot begins to change its height.",
+    rise_start: Leaf = ratio(
+        0, 0, 0.45, "Part of the swing after which the foot begins to change its height."
     )
-    rise_end: Leaf = parameter(
-        1.0,
-        unit="1",
-        low=0.55,
-        high=1.0,
+    rise_end: Leaf = ratio(
+        1,
+        0.55,
+        1,
+        "Part of the swing after which the foot has its next foothold's height.",
         above="rise_start",
-        doc="Part of the swing after which the foot has its next foothold's height.",
     )
-    steepness: Leaf = parameter(
-        1.875,
-        unit="1",
-        low=1.0,
-        high=4.0,
-        doc="How much faster than evenly the height changes in the middle of the swing.",
+    steepness: Leaf = ratio(
+        1.875, 1, 4, "How much faster than evenly the height changes in the middle of the swing."
     )
-    stance_time: Leaf = parameter(
+    stance_time: Leaf = duration(
         0.65,
-        unit="s",
+        0.2,
+        1.5,
+        "How long a foot stands, where the animation does not give its footholds.",
         follows="time",
-        low=0.2,
-        high=1.5,
-        doc="How long a foot stands, where the animation does not give its footholds.",
     )
-    swing_time: Leaf = parameter(
+    swing_time: Leaf = duration(
         0.45,
-        unit="s",
+        0.1,
+        1,
+        "How long a foot swings, where the animation does not give its footholds.",
         follows="time",
-        low=0.1,
-        high=1.0,
-        doc="How long a foot swings, where the animation does not give its footholds.",
     )
 
     remember_swings: bool = option(
         False,
-        doc="Whether footholds that the animation does not give are predicted from each swing so "
+        "Whether footholds that the animation does not give are predicted from each swing so "
         "far, which takes memory and five times as many rays, not from each frame alone.",
     )
 

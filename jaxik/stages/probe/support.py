@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, option, parameter
+from jaxik.maths.parameter_tree import Leaf, length, option, ratio
 from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Stride
@@ -46,22 +46,17 @@ class AbstractSupportedProbe(AbstractSwingProbe):
     """
 
     layers: Leaf = parameter_tree.layers()
-    min_sole: Leaf = parameter(
+    min_sole: Leaf = ratio(
         0.65,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Share of a sole that the ground must support, or the foot slides to where it does.",
+        0,
+        1,
+        "Share of a sole that the ground must support, or the foot slides to where it does.",
     )
-    max_slide: Leaf = parameter(
-        0.10,
-        unit="m",
-        low=0.0,
-        high=0.2,
-        doc="How far a foot slides to better support; longer slides count less and less.",
+    max_slide: Leaf = length(
+        0.1, 0, 0.2, "How far a foot slides to better support; longer slides count less and less."
     )
     slide_to_support: bool = option(
-        False, doc="Whether feet slide to better support, which takes three times as many rays."
+        False, "Whether feet slide to better support, which takes three times as many rays."
     )
 
     @abstractmethod

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
-from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, angle, constant, length, parameter, ratio, switch
 from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
@@ -68,98 +68,69 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     it does: several stairs at once are no reason to lift a foot far above them.
     """
 
-    clearance: Leaf = parameter(
-        0.0,
-        unit="m",
-        low=-0.1,
-        high=0.1,
-        doc="How much of its animated lift a foot may lose as it passes over an edge.",
+    clearance: Leaf = length(
+        0, -0.1, 0.1, "How much of its animated lift a foot may lose as it passes over an edge."
     )
-    heel_length: Leaf = parameter(
-        0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
-    )
-    toe_length: Leaf = parameter(
+    heel_length: Leaf = length(0.07, 0, 0.2, "Distance backward from the ankle to the heel.")
+    toe_length: Leaf = length(
         0.04,
-        unit="m",
-        low=0.0,
-        high=0.2,
-        doc="Distance forward from the ball to the tip of the toes, which bend as they pass.",
+        0,
+        0.2,
+        "Distance forward from the ball to the tip of the toes, which bend as they pass.",
     )
-    ball_height: Leaf = parameter(
-        0.055,
-        unit="m",
-        follows="ball height",
-        low=0.0,
-        high=0.15,
-        doc="Height of the ball joint above the sole.",
+    ball_height: Leaf = length(
+        0.055, 0, 0.15, "Height of the ball joint above the sole.", follows="ball height"
     )
-    held_lift: Leaf = parameter(
+    held_lift: Leaf = ratio(
         0.6,
-        unit="1",
-        low=0.0,
-        high=1.0,
-        doc="Part of its animated lift that a foot holds back early in a step on uneven ground.",
+        0,
+        1,
+        "Part of its animated lift that a foot holds back early in a step on uneven ground.",
     )
-    toe_clearance: Leaf = parameter(
+    toe_clearance: Leaf = length(
         0.03,
-        unit="m",
-        low=0.0,
-        high=0.15,
-        doc="How much higher than animated a foot passes the middle of a step on uneven ground.",
+        0,
+        0.15,
+        "How much higher than animated a foot passes the middle of a step on uneven ground.",
     )
-    lift_per_rise: Leaf = parameter(
-        0.5, unit="1", low=0.0, high=1.5, doc="Height added to a step up, per height of the step."
+    lift_per_rise: Leaf = ratio(0.5, 0, 1.5, "Height added to a step up, per height of the step.")
+    lift_per_fall: Leaf = ratio(
+        0.35, 0, 1.5, "Height added to a step down, early, per height of the step."
     )
-    lift_per_fall: Leaf = parameter(
-        0.35,
-        unit="1",
-        low=0.0,
-        high=1.5,
-        doc="Height added to a step down, early, per height of the step.",
+    lift_over: Leaf = ratio(
+        1.7, 0, 3, "Height added over what stands between the footholds, per height over both."
     )
-    lift_over: Leaf = parameter(
-        1.7,
-        unit="1",
-        low=0.0,
-        high=3.0,
-        doc="Height added over what stands between the footholds, per height over both.",
-    )
-    toes_up: Leaf = parameter(
+    toes_up: Leaf = angle(
         0.1,
-        unit="rad",
-        low=0.0,
-        high=0.6,
-        doc="By how much less a foot points its toes down early in a step on uneven ground.",
+        0,
+        0.6,
+        "By how much less a foot points its toes down early in a step on uneven ground.",
     )
-    toes_down: Leaf = parameter(
-        0.3,
-        unit="rad",
-        low=0.0,
-        high=0.8,
-        doc="By how much more a foot points its toes down late in a step on uneven ground.",
+    toes_down: Leaf = angle(
+        0.3, 0, 0.8, "By how much more a foot points its toes down late in a step on uneven ground."
     )
     toes_down_per_height: Leaf = parameter(
         0.9,
+        0,
+        3,
+        "The same per metre that the ground rises, falls, or stands in the way.",
         unit="rad/m",
-        low=0.0,
-        high=3.0,
-        doc="The same per metre that the ground rises, falls, or stands in the way.",
     )
     toes_first: Leaf = parameter(
         0.5,
+        0,
+        2,
+        "By how much more a foot points its toes down as it lands, per height below the other.",
         unit="rad/m",
-        low=0.0,
-        high=2.0,
-        doc="By how much more a foot points its toes down as it lands, per height below the other.",
     )
     swing_as_animated: Leaf = switch(
-        False, doc="Whether feet swing as animated, over uneven ground too; they still clear edges."
+        False, "Whether feet swing as animated, over uneven ground too; they still clear edges."
     )
     uneven_height: Leaf = constant(
-        0.05, unit="m", doc="Height of a step from which ground counts as uneven."
+        0.05, "Height of a step from which ground counts as uneven.", unit="m"
     )
     highest_step: Leaf = constant(
-        0.30, unit="m", doc="Height of a step up or down, beyond which a higher one adds no more."
+        0.3, "Height of a step up or down, beyond which a higher one adds no more.", unit="m"
     )
 
     def swing(
