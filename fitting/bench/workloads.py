@@ -293,7 +293,7 @@ def problem_from_clips(clips: Iterable[ClipData], names: tuple[str, ...] = tuple
     """The fit of these parameters to recordings."""
     ik = jaxik.presets.record(faithful=True)
     space = make_space(ik, [free_parameter(ik, name) for name in names])
-    scenes = share_world([make_scene(clip, SIGMAS) for clip in clips], ik.probe)
+    scenes = share_world([make_scene(clip, SIGMAS) for clip in clips])
     return Problem(space, tuple(scenes), residuals_of_scenes)
 
 

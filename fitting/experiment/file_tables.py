@@ -11,13 +11,12 @@ import jaxik
 from fitting.inference.mixed_model import Grouping
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.capture_system import PREFIX, is_of_capture, without_ends
-from fitting.problem.scene import GROUND, SHIFT, SPREAD, Capture, Scene
+from fitting.problem.scene import SHIFT, SPREAD, Capture, Scene
 from fitting.problem.space import ParameterPrior, Priors, Space
 from fitting.runtime import validation
 from fitting.runtime.declarations import NEEDED, NUMBER, Key, check_table, key, keys
 from fitting.runtime.validation import Content, Table, check_keys, flatten, nest
 from jaxik.maths import parameter_tree
-from jaxik.stages.probe.capsule import SweepProbe
 
 from .systems import FREE_KEYS, leaf_names, read_free_table, rule_names, with_parameters, with_rules
 
@@ -130,14 +129,8 @@ def prepare(scenes: Sequence[Scene], space: Space[jaxik.FootIK], where: str) -> 
     clip do not count, of which it may show nothing.
 
     Raises:
-        ValueError: the system sweeps shapes over ground that moves, or nothing is left of a clip.
+        ValueError: nothing is left of a clip.
     """
-    ground = [name for name in GROUND for p in space.parameters if p.leaf == f"{PREFIX}{name}"]
-    if ground and isinstance(space.system.probe, SweepProbe):
-        raise ValueError(
-            f"{where}: {ground} cannot be fitted with the probe SweepProbe, whose shapes need the "
-            "ground as it is; leave them out, or choose another probe in [rules]"
-        )
     prepared = list(scenes)
     for parameter in space.parameters:
         if parameter.leaf == f"{PREFIX}{SHIFT}":

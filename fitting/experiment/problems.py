@@ -133,7 +133,6 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
             )
     with activity.announced("Preparing the comparison"):
         for entry, clip in zip(experiment.clips, data, strict=True):
-            clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
             held_out = _held_out(clip.reference, experiment, entry)
             scene = make_scene(clip, experiment.sigmas, entry.label, held_out)
             if (size := experiment.size(scene.rig, rig)) is not None:
@@ -144,7 +143,7 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
         if experiment.capture:
             scenes = file_tables.prepare(scenes, space, f"{experiment.path} [capture]")
         else:
-            scenes = share_world(scenes, ik.probe)
+            scenes = share_world(scenes)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
     weight = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
     problem = Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, weight)

@@ -26,7 +26,6 @@ from jaxtyping import Array, Float, PyTree
 import jaxik
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import Result
-from jaxik.stages.probe import AbstractProbe
 from jaxik.world import grid, places
 from jaxik.world.surfaces import Mesh
 from jaxik.world.terrain import Terrain, merge
@@ -45,7 +44,7 @@ GROWTH = 1.25  # of the lengths that clips are rounded up to: at most a fifth is
 SHORTEST = 32  # frames
 
 
-def share_world(scenes: Sequence[Scene], probe: AbstractProbe) -> list[Scene]:
+def share_world(scenes: Sequence[Scene]) -> list[Scene]:
     """The scenes with places in worlds that as many as possible share; on the host.
 
     Args:
@@ -64,7 +63,7 @@ def share_world(scenes: Sequence[Scene], probe: AbstractProbe) -> list[Scene]:
             offsets = _side_by_side(members, distinct)
             firsts = [distinct.index(terrain) for terrain in sorted(set(distinct))]
             grounds = [members[first].terrain for first in firsts]
-            terrain = probe.prepare(merge(grounds, offsets[firsts]))
+            terrain = merge(grounds, offsets[firsts])
         for number, scene, offset in zip(numbers, members, offsets, strict=True):
             offset_ws = jnp.asarray(offset, scene.frames.dt.dtype)
             place = Place(terrain, offset_ws, numbers[0])

@@ -58,10 +58,9 @@ def with_motion_of(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> Problem[
     """The same problem with references that any system makes, without noise."""
     scenes = []
     for scene in problem.data:
-        own, terrain = own_system(ik, scene), ik.probe.prepare(scene.terrain)
-        tracks = scene.tracks or None
+        own, tracks = own_system(ik, scene), scene.tracks or None
         # The program that also plays clips, which a fit by the same system needs anyway.
-        result = program_cache.run(own, scene.rig, terrain, scene.frames, tracks=tracks)
+        result = program_cache.run(own, scene.rig, scene.terrain, scene.frames, tracks=tracks)
         scenes.append(_with_reference(scene, *_motion(scene, result)))
     return eqx.tree_at(lambda problem: problem.data, problem, tuple(scenes))
 

@@ -148,8 +148,7 @@ class Animation:
         """
         if self.root.rise is not None:
             ik = systems.without_own_root(ik)
-        terrain = ik.probe.prepare(self.terrain)
-        terrain = terrain if self.carried is None else moving(terrain, 0)
+        terrain = self.terrain if self.carried is None else moving(self.terrain, 0)
         result = replace(self, terrain=terrain, given_frames=self.frames).run(ik)
         solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)
         if not np.isfinite(solved.positions_ws).all():
@@ -157,7 +156,7 @@ class Animation:
         return result, solved
 
     def run(self, ik: jaxik.FootIK) -> jaxik.Result:
-        """The result of a system on the terrain, which its probe has prepared; NumPy arrays."""
+        """The result of a system on the terrain; NumPy arrays."""
         count = len(self.frames.dt)
         repeats = -count % PADDED  # of the last frame, which change nothing before them
 

@@ -175,13 +175,13 @@ def session_of_animation(
         starts = {name: systems.without_own_root(ik) for name, ik in starts.items()}
     first = next(iter(starts.values()))
     loaded.check_shapes(first)
-    terrain, captured, cost = first.probe.prepare(loaded.terrain), loaded.captured, None
+    captured, cost = loaded.captured, None
     if captured is not None:
         captured = with_soles_of(captured, loaded.clip)
         if files.floor == 0.0:  # a scene knows no other
-            data = ClipData(captured, loaded.clip, terrain, loaded.root, loaded.tracks)
+            data = ClipData(captured, loaded.clip, loaded.terrain, loaded.root, loaded.tracks)
             cost = partial(cost_of_scenes, (problems.make_scene(data, {}),))
-    prepared = replace(loaded, terrain=terrain, given_frames=loaded.frames, captured=captured)
+    prepared = replace(loaded, given_frames=loaded.frames, captured=captured)
     title = f"{files.clip.name} on {files.terrain.name}"
     return Session(title, (SessionClip(files.clip.name, prepared),), starts, preset, cost=cost)
 

@@ -2,8 +2,8 @@
 
 Plain data (structs of arrays) and what follows from it directly: forward kinematics, and the first
 hits of parallel rays. Nothing here decides anything; that is the work of `jaxik.stages`. It is no
-physics engine either: rays and shapes run along -up only, and nothing else collides. Start with
-`skeleton` (`Transform`, `LegPose`, `Rig`), then `terrain`, then `frame`; `sweep` has the shapes.
+physics engine either: rays run along -up only, and nothing else collides. Start with `skeleton`
+(`Transform`, `LegPose`, `Rig`), then `terrain`, then `frame`.
 """
 
 import lazy_loader

@@ -9,5 +9,4 @@ from . import places as places
 from . import similarity as similarity
 from . import skeleton as skeleton
 from . import surfaces as surfaces
-from . import sweep as sweep
 from . import terrain as terrain

@@ -82,10 +82,8 @@ class Mesh(AbstractSurface):
     triangles: Int[Array, "*t triangles 3"]
     layers: UInt[Array, "*t triangles"]  # one bit each
     grid: Grid
-    wide: Grid | None = None
-    """For shapes (`jaxik.world.sweep.sweepable`): lists triangles beside a cell too."""
     offset_ws: Float[Array, "*t 3"] | None = None
-    """m, to be added to vertices and grids; None for nothing."""
+    """m, to be added to vertices and grid; None for nothing."""
 
     def moved(self, by_ws: Float[Array, "3"]) -> "Mesh":
         offset_ws = by_ws if self.offset_ws is None else self.offset_ws + by_ws
@@ -104,8 +102,7 @@ class Mesh(AbstractSurface):
         """
         triangles, layers = self.triangles, self.layers
         grid = self.grid.with_vertices(vertices_ws, triangles, layers)
-        wide = self.wide and self.wide.with_vertices(vertices_ws, triangles, layers)
-        return Mesh(vertices_ws, triangles, layers, grid, wide, self.offset_ws)
+        return Mesh(vertices_ws, triangles, layers, grid, self.offset_ws)
 
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]

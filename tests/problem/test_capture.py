@@ -200,10 +200,6 @@ def test_every_clip_has_numbers_of_its_own_with_narrow_priors(tmp_path):
             {"rest": "[capture]\ntime_shift = { low = -0.6, high = 0.6 }"},
             "nothing is left of clip 1",
         ),
-        (
-            {"rest": "[capture]\nground_height = {}", "top": 'rules.probe = "SweepProbe"'},
-            r"\['ground_height'\] cannot be fitted with the probe SweepProbe",
-        ),
     ],
 )
 def test_a_table_that_makes_no_sense_costs_one_sentence(tmp_path, parts, message):

@@ -67,7 +67,7 @@ def apart(scenes: Sequence[Scene]) -> tuple[Scene, ...]:
 
 
 def placed(scenes: Sequence[Scene]) -> list[Scene]:
-    return share_world(apart(scenes), jaxik.presets.record().probe)
+    return share_world(apart(scenes))
 
 
 @pytest.fixture(scope="module")

@@ -62,12 +62,11 @@ ReachPelvis: highest_share 1 0.75 0 1.2; extension 1 0.958 0.85 1; softness m 0.
 ReachPelvis SlopeTarget: rise_half_life s 0 0.002 0.5; fall_half_life s 0 0.002 0.5
 SupportPelvis: lowest_share 1 0.3 0 1; rise_half_life s 0.1 0.002 0.5;
   fall_half_life s 0.1 0.002 0.5
-SweepProbe CornerProbe FootProbe RootProbe StrideProbe: max_step_up m 0.3 0.1 1;
+CornerProbe FootProbe RootProbe StrideProbe: max_step_up m 0.3 0.1 1;
   max_step_down m 0.4 0.1 1; max_slope rad 0.785 0.1 1.5; min_support 1 0.5 0 1;
   support_radius m 0.04 0.01 0.15
-SweepProbe CornerProbe FootProbe: ray_up m 0.5 0 2
-SweepProbe FootProbe: ray_down m 0.8 0 2
-SweepProbe: radius m 0.04 0.01 0.1; toe_length m 0.15 0 0.25; heel_length m 0.03 0 0.15
+CornerProbe FootProbe: ray_up m 0.5 0 2
+FootProbe: ray_down m 0.8 0 2
 CornerProbe: foot_length m 0.2 0.02 0.5; half_width m 0.05 0.01 0.2; extra m 0.2 0 1;
   extra_min m 0 0 1; extra_max m 0.3 0 1; stable_height m 0.12 0 0.5; stable_speed m/s 0.5 0 3
 FootProbe: toe_ls m 0,-0.07,0.2 -0.4 0.4
@@ -144,7 +143,7 @@ RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
 StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no
 StrideProbe.use_strides=yes
-SupportPelvis.spring=no SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
+SupportPelvis.spring=no TwoBone.as_animated=no
 """
 
 

@@ -12,15 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 
 import jaxik
 from jaxik import HARD
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs
-from jaxik.stages.probe import AbstractProbe, FootProbe, SweepProbe, foot_heading
+from jaxik.stages.probe import foot_heading
 from jaxik.stages.probe.limits import AbstractLimitedProbe
-from jaxik.world import terrain
 from jaxik.world.frame import GroundHits
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths
@@ -28,7 +26,7 @@ from reference.characters import Footing, Parameters
 from reference.stages import limits
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import RIG
-from support.clips import animate, at, planes, to_frames, to_rig, to_terrain
+from support.clips import animate, at, to_frames, to_rig, to_terrain
 from support.probing import BLOCKS, ground_under, level_blocks, quad
 
 LIMITS = {"max_step_up": 0.3, "max_step_down": 0.25, "max_slope": 0.7}
@@ -258,47 +256,3 @@ def test_no_foot_stands_on_a_post_but_on_the_floor_below(preset):
         assert on_posts.point[:, 1].max() > 0.1, "feet would stand there"
     hits = on_blocks(ik, *posts, FLOOR).ankle
     np.testing.assert_allclose(hits.found * (hits.point[:, 1] + 0.02), 0.0, rtol=0, atol=1e-9)
-
-
-# The probe that is as wide as a foot.
-
-
-def under_left_foot(probe: AbstractProbe, ground: terrain.Terrain) -> list[np.ndarray]:
-    """Heights, m, normals and weights of what a probe finds there, up to 0.3 m on."""
-    along = np.linspace(0.0, 0.3, 61)[:, None] * maths.Z
-    frames = to_frames([FRAME] * 61).translated(jnp.asarray(along))
-    ik = dataclasses.replace(jaxik.presets.ozz(), probe=probe)
-    hit = ground_under(ik, ground, frames).ankle
-    return [np.asarray(x)[:, 0] for x in (hit.point[..., 1], hit.normal, hit.found)]
-
-
-def grating() -> terrain.Terrain:
-    """Bars 10 cm wide with gaps of 5 cm between them, 0.3 m over a floor."""
-    bars = [
-        trimesh.creation.box((4.0, 0.1, 0.1)).apply_translation((0.0, -0.05, 0.15 * number))
-        for number in range(-4, 9)
-    ]
-    mesh: Any = trimesh.util.concatenate(bars)
-    level = terrain.mesh(np.array(mesh.vertices), np.array(mesh.faces))
-    return terrain.combine(level, terrain.plane((0.0, -0.3, 0.0)))
-
-
-def test_on_slopes_a_sweep_finds_what_rays_find():
-    slope = to_terrain(planes((0.5, -0.3, 0.0)))
-    swept, cast = (
-        under_left_foot(probe, slope) for probe in (SweepProbe(), FootProbe(use_toe=False))
-    )
-    for ours, theirs in zip(swept, cast, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
-
-
-def test_a_foot_that_is_swept_does_not_fall_through_a_grating():
-    ground = grating()
-    height, normal, found = under_left_foot(SweepProbe(), SweepProbe().prepare(ground))
-    np.testing.assert_allclose(height, 0.0, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(normal, np.tile(maths.Y, (61, 1)), rtol=0, atol=1e-9)
-    assert (found == 1).all()
-    cast, _, _ = under_left_foot(FootProbe(use_toe=False), ground)
-    assert np.ptp(cast) == pytest.approx(0.3), "rays do"
-    with pytest.raises(ValueError, match="sweepable"):
-        under_left_foot(SweepProbe(), ground)

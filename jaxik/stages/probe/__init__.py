@@ -2,8 +2,7 @@
 
 `base` has the abstract rule and what all share, `limits` decides which ground is refused, `games`
 has the rules of ozz, Unreal, Mec and the record, `stride` the one that looks ahead to the next
-foothold, `capsule` one that is as wide as the foot. To write a rule, start with
-`base.AbstractProbe`, or with `limits.AbstractLimitedProbe`.
+foothold. To write a rule, start with `base.AbstractProbe`, or with `limits.AbstractLimitedProbe`.
 """
 
 from .base import AbstractProbe as AbstractProbe
@@ -11,7 +10,6 @@ from .base import foot_heading as foot_heading
 from .base import make_rays as make_rays
 from .base import no_hit as no_hit
 from .base import toe_point as toe_point
-from .capsule import SweepProbe as SweepProbe
 from .games import CornerProbe as CornerProbe
 from .games import FootProbe as FootProbe
 from .games import RootProbe as RootProbe

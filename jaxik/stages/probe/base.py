@@ -2,7 +2,6 @@
 
 import dataclasses
 from abc import abstractmethod
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,19 +22,13 @@ from jaxik.world.frame import (
     heading,
 )
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import Hit, LegTerrains, Terrain
+from jaxik.world.terrain import Hit, Terrain
 
 SAME_STEP, SAME_FADE = 0.05, 0.03  # m, between hits under one sole, and over which it fades
-
-Ground = TypeVar("Ground", Terrain, LegTerrains)
 
 
 class AbstractProbe(Rule):
     """Finds the ground under the feet."""
-
-    def prepare(self, terrain: Ground) -> Ground:
-        """The terrain with all that this probe needs of it; on the host, so not under jit."""
-        return terrain
 
     def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame; None for a probe that goes by each frame alone."""

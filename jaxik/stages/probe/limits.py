@@ -87,7 +87,7 @@ class AbstractLimitedProbe(AbstractProbe):
         """
         up = inputs.terrain.leg_up_ws
         if not self.limited:
-            return self.find(inputs, starts_ws, reach, layers)
+            return cast(inputs.terrain, starts_ws, reach, layers)
         margin = jnp.zeros_like(starts_ws[..., 0]) if margin is None else margin
         origin = level_origin(inputs)
         above = vec.dot(starts_ws - origin, up) - self.max_step_up - margin
@@ -95,7 +95,7 @@ class AbstractLimitedProbe(AbstractProbe):
         # Both by one search: each search adds much to a program.
         starts = jnp.stack([starts_ws, starts_ws - vec.scale(up, above)])
         reaches = jnp.stack([reach + jnp.zeros_like(above), reach - above])
-        hits = self.find(inputs, starts, reaches, layers)
+        hits = cast(inputs.terrain, starts, reaches, layers)
         accepted = hits.found * self.trust_from(origin, hits, up, margin)
         if self.check_support and stood_on:
             accepted *= self._trust_of_width(inputs, starts, reaches, hits, layers)
@@ -115,10 +115,6 @@ class AbstractLimitedProbe(AbstractProbe):
             found,
             platform,
         )
-
-    def find(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
-        """What lies below points above the feet, whether it is accepted or not; see `cast`."""
-        return cast(inputs.terrain, starts_ws, reach, layers)
 
     def trust(self, step: Array, normal: Array, up_ws: Array) -> Array:
         """0..1, how far ground with this normal is accepted after a step of this height, m."""

@@ -12,7 +12,7 @@ from jaxik.maths.parameter_tree import Leaf, length, option, ratio
 from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Stride
-from jaxik.world.terrain import Hit
+from jaxik.world.terrain import Hit, cast
 
 from .base import foot_heading
 from .limits import climb
@@ -98,7 +98,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         steps = vec.scale(ahead, tenth) * jnp.asarray(LINE, tenth.dtype)[:, None, None, None]
         starts = level.project(footholds_ws) + steps + vec.scale(up, top)
         reach = self.max_step_up + self.max_step_down + 2.0 * margin * (1.0 - foothold.found)
-        line = self.find(inputs, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
+        line = cast(inputs.terrain, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
         heights = level.height(line.point)  # (points ends legs)
         firm = line.found * self.trust_from(level.origin_ws, line, up, margin)
 
