@@ -12,7 +12,6 @@ import math
 from jaxik.pipeline import FootIK
 from jaxik.stages.contact import (
     HeightContact,
-    IdleContact,
     LabelContact,
     SpeedContact,
     StandingContact,
@@ -21,19 +20,18 @@ from jaxik.stages.effector import (
     BodyEffector,
     DirectEffector,
     FadeEffector,
-    FoundEffector,
     HeelEffector,
 )
 from jaxik.stages.fade import NoFade, SpeedFade
 from jaxik.stages.foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
 from jaxik.stages.lean import NoLean, SlopeLean, SpineLean
-from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
+from jaxik.stages.leg import PoleLeg, TwoBone
 from jaxik.stages.lock import NoLock, OffsetLock, PlantLock
 from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
 from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe, StrideProbe
 from jaxik.stages.root import GroundRoot, KeepRoot
 from jaxik.stages.separation import FootSeparation, NoSeparation
-from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
+from jaxik.stages.target import RootTarget, SlopeTarget, SoleTarget
 from jaxik.stages.warp import StrideWarp
 from jaxik.world import body
 from jaxik.world.skeleton import Rig
@@ -126,7 +124,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         lock=NoLock(),
         separation=NoSeparation(),
         pelvis=LowestPelvis(limit=math.inf, on_gain=1.0, off_gain=1.0),
-        effector=FoundEffector(),
+        effector=DirectEffector(if_found=True),
         leg=PoleLeg(),
         foot=AimFoot(),
         fade=NoFade() if faithful else SpeedFade(),
@@ -153,7 +151,7 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
         probe=RootProbe(limited=not faithful),
-        contact=IdleContact() if faithful else IdleContact(idle_speed=0.1),
+        contact=StandingContact(idle_speed=0.0 if faithful else 0.1),
         target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
         lean=NoLean(),
         lock=NoLock(),
@@ -187,13 +185,13 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         warp=StrideWarp(),
         probe=CornerProbe(limited=False),
         contact=StandingContact(),
-        target=ContactTarget(),
+        target=SoleTarget(max_slope=0.0, foot_height=0.1),
         lean=NoLean(),
         lock=PlantLock(),
         separation=NoSeparation(),
         pelvis=LegLengthPelvis(),
         effector=FadeEffector(),
-        leg=HintLeg(),
+        leg=PoleLeg(to_hint=True),
         foot=FlatFoot(),
         fade=NoFade() if faithful else SpeedFade(),
     )
@@ -205,7 +203,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 by_speed=True, stable_speed=0.25, stable_height=body.ANKLE + 0.01, extra_min=-0.03
             ),
             contact=SpeedContact(**STANDING),
-            target=ContactTarget(foot_height=body.ANKLE),
+            target=SoleTarget(max_slope=0.0, foot_height=body.ANKLE),
             lock=PlantLock(release_distance=0.15, release_angle=0.5),
             pelvis=LegLengthPelvis(max_length=body.LEG),
             separation=FootSeparation(),

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import equinox as eqx
 import numpy as np
 
 import jaxik
@@ -18,7 +19,7 @@ from fitting.runtime.declarations import NEEDED, NUMBER, Key, check_table, key, 
 from fitting.runtime.validation import Content, Table, check_keys, flatten, nest
 from jaxik.maths import parameter_tree
 
-from .systems import FREE_KEYS, leaf_names, read_free_table, rule_names, with_parameters, with_rules
+from .systems import FREE_KEYS, leaf_names, read_free_table, with_parameters, with_rules
 
 COMPLETE = "all rules"  # the name of the experiment with nothing left out
 
@@ -68,7 +69,7 @@ def _read(table: Ablation, ik: jaxik.FootIK, where: str) -> Ablation:
     with_parameters(other, parameters, f"{where}: parameters")
     leaves = {full.partition("[")[0]: None for full in free}  # one leg's element has an index
     validation.check_keys(leaves, leaf_names(other), f"{where}: free")
-    if not parameters and not free and rule_names(other) == rule_names(ik):
+    if not parameters and not free and eqx.tree_equal(other, ik):
         raise ValueError(f"{where}: changes nothing; wanted other rules or parameters")
     return dataclasses.replace(table, parameters=parameters, free=free)
 

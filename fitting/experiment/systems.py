@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from inspect import signature
-from typing import Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -28,6 +28,34 @@ def _concrete_rules(rule: type[eqx.Module]) -> list[type[eqx.Module]]:
 STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules to choose from, by stage and name
     stage.name: {rule.__name__: rule for rule in _concrete_rules(stage.type)}  # type: ignore[arg-type]
     for stage in fields(jaxik.FootIK)
+}
+
+
+class FormerRule(NamedTuple):
+    """What the name of a rule meant before rules were merged."""
+
+    name: str
+    """Of the rule as which it lives on."""
+    values: Mapping[str, float]
+    """What that rule has other than its defaults."""
+    is_meant: Callable[[Any], Any]
+    """Whether a rule of that name already is the former one, whatever its other values."""
+
+
+FORMER_RULES = {
+    "IdleContact": FormerRule(
+        "StandingContact", {"idle_speed": 0.0}, lambda rule: np.isfinite(rule.idle_speed)
+    ),
+    "StandingContact": FormerRule("StandingContact", {}, lambda rule: np.isinf(rule.idle_speed)),
+    "NoWarp": FormerRule("StrideWarp", {"max_scale": 1.0, "min_scale": 1.0}, lambda rule: False),
+    "ContactTarget": FormerRule(
+        "SoleTarget", {"max_slope": 0.0, "foot_height": 0.1}, lambda rule: rule.max_slope == 0
+    ),
+    "SoleTarget": FormerRule("SoleTarget", {}, lambda rule: rule.max_slope > 0),
+    "FoundEffector": FormerRule("DirectEffector", {"if_found": True}, lambda rule: rule.if_found),
+    "DirectEffector": FormerRule("DirectEffector", {}, lambda rule: ~rule.if_found),
+    "HintLeg": FormerRule("PoleLeg", {"to_hint": True}, lambda rule: rule.to_hint),
+    "PoleLeg": FormerRule("PoleLeg", {}, lambda rule: ~rule.to_hint),
 }
 
 OWN_ROOT = "root.enabled"  # set by an experiment only to overrule where clips put the root
@@ -151,7 +179,8 @@ def with_rules(
 ) -> jaxik.FootIK:
     """The system with other rules at some stages.
 
-    A rule that the system has already keeps its values; a new one has its defaults.
+    A rule that the system has already keeps its values; a new one has its defaults. Names of
+    earlier releases mean what they meant then.
 
     Args:
         ik: the system.
@@ -164,13 +193,15 @@ def with_rules(
     """
     check_keys(names, list(STAGES), where)
     present = rule_names(ik)
+    rules = {}
     for stage, name in names.items():
-        if name not in list(STAGES[stage]):
+        former = FORMER_RULES.get(str(name), FormerRule(str(name), {}, lambda rule: True))
+        if former.name not in STAGES[stage]:
             known = list(STAGES[stage])
             raise ValueError(f"{where}: {stage} has no rule {name!r}; it has {known}")
-    changed = {stage: name for stage, name in names.items() if name != present[stage]}
-    rules = {stage: STAGES[stage][name]() for stage, name in changed.items()}
-    return replace(ik, **{stage: body.scale(rule, rig) for stage, rule in rules.items()})
+        if former.name != present[stage] or not np.all(former.is_meant(getattr(ik, stage))):
+            rules[stage] = body.scale(STAGES[stage][former.name](**former.values), rig)
+    return replace(ik, **rules)
 
 
 def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:

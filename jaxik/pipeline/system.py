@@ -21,7 +21,7 @@ from jaxik.stages.probe import AbstractProbe
 from jaxik.stages.root import AbstractRoot
 from jaxik.stages.separation import AbstractSeparation
 from jaxik.stages.target import AbstractTarget
-from jaxik.stages.warp import AbstractWarp
+from jaxik.stages.warp import StrideWarp
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 
@@ -47,7 +47,7 @@ class FootIK(Rule):
 
     contact: AbstractContact
     root: AbstractRoot
-    warp: AbstractWarp
+    warp: StrideWarp
     probe: AbstractProbe
     target: AbstractTarget
     lean: AbstractLean

@@ -1,6 +1,7 @@
 """Stage 1: which feet of the animation stand."""
 
 from abc import abstractmethod
+from math import inf
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -87,19 +88,13 @@ class HeightContact(AbstractInstantContact):
 
 
 class StandingContact(AbstractInstantContact):
-    """All feet always stand, so that foot IK works wherever there is ground (ozz, Mec)."""
+    """All feet stand, so that foot IK works wherever there is ground (ozz, Mec).
 
-    def sense(self, inputs: Inputs) -> Contact:
-        lift = inputs.frame.pose.ankle.pos[..., 1]
-        ones, zeros = jnp.ones_like(lift), jnp.zeros_like(lift)
-        return Contact(lift, ones, ones, zeros)
-
-
-class IdleContact(AbstractInstantContact):
-    """All feet stand while the character stands still, none while it moves (Unreal)."""
+    With a finite `idle_speed` they stand while the character stands still only (Unreal).
+    """
 
     idle_speed: Leaf = threshold(
-        0, 0, 3, "Speed of the character up to which it counts as standing still.", unit="m/s"
+        inf, 0, 3, "Speed of the character up to which its feet stand.", unit="m/s"
     )
 
     def sense(self, inputs: Inputs) -> Contact:

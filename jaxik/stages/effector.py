@@ -88,25 +88,19 @@ class AbstractInstantEffector(AbstractEffector):
 
 
 class DirectEffector(AbstractInstantEffector):
-    """The targets themselves; a foot without ground goes to its animated place."""
+    """The targets themselves; a foot without ground goes to its animated place.
 
+    With `if_found` on, the leg of a foot without ground moves with the body instead (ozz).
+    """
+
+    if_found: Leaf = switch(False, "Whether only feet that found ground get foot IK.")
     by_contact: Leaf = _contact_switch()
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        return None, Effector(target.pos, target.rot, jnp.ones_like(now.sensed.weight))
-
-
-class FoundEffector(AbstractInstantEffector):
-    """The targets of feet with ground; other legs move with the body (ozz)."""
-
-    by_contact: Leaf = _contact_switch()
-
-    def advance(
-        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
-    ) -> tuple[None, Effector]:
-        return None, Effector(target.pos, target.rot, now.sensed.foothold.found)
+        weight = jnp.where(self.if_found, now.sensed.foothold.found, 1.0)
+        return None, Effector(target.pos, target.rot, weight)
 
 
 class HeelEffector(AbstractInstantEffector):

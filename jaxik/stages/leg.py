@@ -144,29 +144,14 @@ class TwoBone(AbstractLeg):
 class PoleLeg(AbstractLeg):
     """ozz's two-bone job: the leg's plane contains a pole, here that of the animated knee.
 
-    The pole is perpendicular to hinge and shin. That is the knee's y axis in a rig whose x axis
-    points along the bone and whose z axis is the hinge. With `enabled` off legs move with the body.
+    That pole is perpendicular to hinge and shin: the knee's y axis in a rig whose x axis points
+    along the bone and whose z axis is the hinge. With `to_hint` on, the pole points from the hip to
+    a hint in front of the shin (Mec): the toe's hit on the ground, plus the animated vector from
+    ankle to knee, plus `hint_offset` in character axes. With `enabled` off legs move with the body.
     """
 
     enabled: Leaf = switch(True, "Whether legs are solved.")
-    soften: Leaf = _soften_parameter(1.0, low=0.1)
-    twist: Leaf = _twist_parameter()
-    weight: Leaf = _weight_parameter()
-
-    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
-        limb = limb_of(inputs.rig, goal.pose)
-        pole = vec.cross(limb.hinge, limb.to_ankle)
-        goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
-        return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
-
-
-class HintLeg(AbstractLeg):
-    """Like `PoleLeg`, but the pole points from the hip to a hint in front of the shin (Mec).
-
-    The hint is the toe's hit on the ground, plus the animated vector from ankle to knee, plus
-    `hint_offset` in character axes (x left, y up, z forward).
-    """
-
+    to_hint: Leaf = switch(False, "Whether knees turn to hints over the toes.")
     hint_offset: Leaf = length(
         (0, 0, 0),
         -0.5,
@@ -178,11 +163,15 @@ class HintLeg(AbstractLeg):
     weight: Leaf = _weight_parameter()
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
-        frame = inputs.frame
+        limb, frame = limb_of(inputs.rig, goal.pose), inputs.frame
         toe = frame.world_from_model.inverse().apply(sensed.ground.toe.point)
-        calf = frame.pose.knee.pos - frame.pose.ankle.pos
-        pole = toe + calf + self.hint_offset - goal.pose.hip.pos
-        return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
+        hint = toe + frame.pose.knee.pos - frame.pose.ankle.pos + self.hint_offset
+        own_pole = vec.cross(limb.hinge, limb.to_ankle)
+        to_hint = jnp.expand_dims(self.to_hint, -1)
+        pole = jnp.where(to_hint, hint - goal.pose.hip.pos, own_pole)
+        target = PoleTarget(goal.target_ms - goal.pose.hip.pos, pole, self.twist)
+        goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
+        return bend_leg(inputs.rig, goal, bend_to_pole(limb, target, self.soften, inputs.gate))
 
 
 def is_full(weight: Array) -> Array:
@@ -195,15 +184,6 @@ def limb_of(rig: Rig, pose: LegPose) -> Limb:
     to_hip = vec.subtract(pose.hip.pos, pose.knee.pos)
     to_ankle = vec.subtract(pose.ankle.pos, pose.knee.pos)
     return Limb(to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls))
-
-
-def solve_to_pole(
-    inputs: Inputs, goal: LegGoal, pole_ms: Array, soften: Array, twist: Array
-) -> SolvedLeg:
-    """The legs, bent in the plane that contains the direction `pole_ms`."""
-    limb = limb_of(inputs.rig, goal.pose)
-    target = PoleTarget(goal.target_ms - goal.pose.hip.pos, pole_ms, twist)
-    return bend_leg(inputs.rig, goal, bend_to_pole(limb, target, soften, inputs.gate))
 
 
 def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:

@@ -169,8 +169,8 @@ class SlopeTarget(AbstractTarget):
 class SoleTarget(AbstractInstantTarget):
     """Puts the sole on the ground whatever the animated lift: `ankle = I + u h / (n·u)` (ozz).
 
-    I is the hit, u up, n the ground's normal and h `foot_height`. Without ground the foothold is
-    that of the animation.
+    I is the hit, u up, n the ground's normal and h `foot_height`. With a `max_slope` of 0 the ankle
+    is h above the ground on slopes too (Mec). Without ground the foothold is that of the animation.
     """
 
     foot_height: Leaf = length(
@@ -184,25 +184,6 @@ class SoleTarget(AbstractInstantTarget):
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
-        without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
-        point_ws = smoothing.lerp(without_ground, hit.point, hit.found[..., None])
-        return foothold(frame, up_ws, point_ws, lift, hit.found)
-
-
-class ContactTarget(AbstractInstantTarget):
-    """Puts the ankle `foot_height` above the ground along up, on slopes too: `I + u h` (Mec).
-
-    Without ground the foothold is that of the animation.
-    """
-
-    foot_height: Leaf = length(
-        0.1, 0, 0.2, "Height of the ankle above the ground, on slopes too.", follows="ankle height"
-    )
-
-    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
-        frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
-        hit = ground.ankle
-        lift = jnp.broadcast_to(self.foot_height, hit.found.shape)
         without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
         point_ws = smoothing.lerp(without_ground, hit.point, hit.found[..., None])
         return foothold(frame, up_ws, point_ws, lift, hit.found)

@@ -1,7 +1,5 @@
 """Stage 3: strides scaled for a character that is faster or slower than its animation."""
 
-from abc import abstractmethod
-
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
@@ -13,22 +11,7 @@ from .inputs import Inputs
 SCALE_BAND = 0.02
 
 
-class AbstractWarp(Rule):
-    """Moves the animated feet before ground is looked for under them."""
-
-    @abstractmethod
-    def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
-        """How far each foot moves, m, world space; None, which costs nothing, where none does."""
-
-
-class NoWarp(AbstractWarp):
-    """Strides stay as animated, however fast the character is."""
-
-    def sense(self, inputs: Inputs) -> None:
-        return None
-
-
-class StrideWarp(AbstractWarp):
+class StrideWarp(Rule):
     """Scales strides with the speed of the character, so that standing feet do not skate.
 
     The root of a character that is k times as fast as its animation (`Frame.stride_scale`) moves by
@@ -49,6 +32,7 @@ class StrideWarp(AbstractWarp):
     width: Leaf = ratio(1, 0, 1, "How much the width of steps is scaled with their length.")
 
     def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
+        """How far each foot moves, m, world space; None, which costs nothing, where none does."""
         frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
         if frame.stride_scale is None:
             return None

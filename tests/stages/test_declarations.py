@@ -22,7 +22,7 @@ from jaxik.maths.parameter_tree import Rule
 PUBLISHED = """
 HeightContact LabelContact SpeedContact: ground_height m 0 -0.5 0.5
 HeightContact: planted_height m 0.1 0 0.4; raised_height m 0.16 0 0.6
-IdleContact: idle_speed m/s 0 0 3
+StandingContact: idle_speed m/s inf 0 3
 SpeedContact: planted_height m 0.075 0 0.4; raised_height m 0.1 0 0.6; planted_speed m/s 0.25 0 1.5;
   raised_speed m/s 0.5 0 3; half_life s 0 0.002 0.5
 BodyEffector CapsulePelvis: speed 1/s 15 0.5 30
@@ -31,7 +31,7 @@ FadeEffector: transition_time s 0.2 0 1
 HeelEffector: extension 1 0.98 0.8 1; max_lift rad 0.6 0 1.2
 SpeedFade: speed m/s 0.5 0.1 3
 AimFoot: offset m 0,0,0 -0.2 0.2
-AimFoot HintLeg PoleLeg TwoBone: twist rad 0 -1 1; weight 1 1 0 1
+AimFoot PoleLeg TwoBone: twist rad 0 -1 1; weight 1 1 0 1
 FlatFoot: max_tilt rad 0.7853982 0 1.5
 PitchRollFoot: max_pitch rad 0.52 0 1.4; min_pitch rad -0.79 -1.4 0; max_roll rad 0.26 0 1;
   min_roll rad -0.52 -1 0
@@ -42,8 +42,8 @@ SpineLean: uphill_rate 1 -0.65 -1 1; downhill_rate 1 -0.25 -1 1; side_rate 1 0 -
   forward_rate_slide 1 0 -1 1; side_rate_slide 1 0 -1 1; head_share 1 0.5 0 1;
   pelvis_rate 1 -0.25 -1 1; pelvis_side_rate 1 0 -1 1; spacing m 0.3 0.05 2
 SpineLean GroundRoot: half_life s 0.2 0.002 0.5
-HintLeg: hint_offset m 0,0,0 -0.5 0.5
-HintLeg PoleLeg: soften 1 1 0.1 1
+PoleLeg: hint_offset m 0,0,0 -0.5 0.5
+PoleLeg: soften 1 1 0.1 1
 TwoBone: max_knee_angle rad 3.000053 2 3.141593; min_knee_angle rad 0.6982008 0 1.8;
   soften 1 0.98 0.8 1
 OffsetLock: release_min_angle rad 0.8726646 0 1.8; release_max_angle rad 3.001966 2 3.141593;
@@ -80,7 +80,6 @@ StrideProbe: ray_up m 1 0 2; ray_down m 1 0 2; rise_start 1 0 0 0.45; rise_end 1
   max_slide m 0.1 0 0.2; stance_time s 0.65 0.2 1.5; swing_time s 0.45 0.1 1
 GroundRoot: ray_up m 10 0 20; ray_down m inf 0 20; max_speed m/s 4 0.5 10; max_step m 0.4 0.1 1
 FootSeparation: distance m 0.1 0 0.3; half_life s 0.04 0.002 0.5
-ContactTarget: foot_height m 0.1 0 0.2
 RootTarget: adjust m 0 -0.1 0.1
 SlopeTarget: min_ankle_height m -0.3 -1 0.5; max_ankle_height m 0.55 0 1.5;
   foot_height m 0.08 0 0.2; max_slope rad 1.047198 0.1 1.5; max_penetration m inf 0 0.2
@@ -104,23 +103,27 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
   OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade
 ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no; SoleTarget; NoLean;
-  NoLock; NoSeparation; LowestPelvis limit=inf on_gain=1 off_gain=1; FoundEffector; PoleLeg;
+  NoLock; NoSeparation; LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes;
+  PoleLeg;
   AimFoot; SpeedFade
 ozz!: StandingContact; GroundRoot half_life=0; StrideWarp;
   FootProbe limited=no ray_down=inf use_toe=no; SoleTarget; NoLean; NoLock; NoSeparation;
-  LowestPelvis limit=inf on_gain=1 off_gain=1; FoundEffector; PoleLeg; AimFoot; NoFade
-unreal: IdleContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean; NoLock;
-  NoSeparation; CapsulePelvis; BodyEffector latch=yes;
-  TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade
-unreal!: IdleContact; GroundRoot enabled=no; StrideWarp; RootProbe limited=no; RootTarget; NoLean;
+  LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes; PoleLeg; AimFoot;
+  NoFade
+unreal: StandingContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean;
   NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
+  TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade
+unreal!: StandingContact idle_speed=0; GroundRoot enabled=no; StrideWarp; RootProbe limited=no;
+  RootTarget; NoLean; NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade
 mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; GroundRoot; StrideWarp;
   CornerProbe by_speed=yes extra_min=-0.03 stable_height=0.095 stable_speed=0.25;
-  ContactTarget foot_height=0.085; NoLean; PlantLock release_distance=0.15 release_angle=0.5;
-  FootSeparation; LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg; FlatFoot; SpeedFade
-mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no; ContactTarget;
-  NoLean; PlantLock; NoSeparation; LegLengthPelvis; FadeEffector; HintLeg; FlatFoot; NoFade
+  SoleTarget max_slope=0 foot_height=0.085; NoLean;
+  PlantLock release_distance=0.15 release_angle=0.5; FootSeparation;
+  LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg; FlatFoot; SpeedFade
+mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no;
+  SoleTarget max_slope=0 foot_height=0.1; NoLean; PlantLock; NoSeparation; LegLengthPelvis;
+  FadeEffector; PoleLeg to_hint=yes; FlatFoot; NoFade
 stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
@@ -134,11 +137,13 @@ SWITCHES = """
 AimFoot.enabled=yes BodyEffector.by_contact=no BodyEffector.latch=no CapsulePelvis.enabled=yes
 CornerProbe.active=yes CornerProbe.by_height=yes CornerProbe.by_speed=no
 CornerProbe.check_support=no CornerProbe.limited=yes DirectEffector.by_contact=no
+DirectEffector.if_found=no
 FadeEffector.by_contact=no FootProbe.check_support=no FootProbe.limited=yes FootProbe.use_toe=yes
-FoundEffector.by_contact=no GroundRoot.enabled=yes HeelEffector.by_contact=no
+GroundRoot.enabled=yes HeelEffector.by_contact=no
 LegLengthPelvis.damp=yes LegLengthPelvis.enabled=yes LowestPelvis.enabled=yes
 LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=yes
-OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes ReachPelvis.spring=no
+OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes PoleLeg.to_hint=no
+ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
 StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no

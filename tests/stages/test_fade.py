@@ -13,7 +13,7 @@ import jaxik
 from jaxik import HARD, Transform
 from jaxik.pipeline.system import Trace
 from jaxik.stages.contact import LabelContact
-from jaxik.stages.effector import FoundEffector
+from jaxik.stages.effector import DirectEffector
 from jaxik.stages.fade import SpeedFade
 from jaxik.stages.inputs import SensedMoment
 from jaxik.stages.root import KeepRoot
@@ -85,7 +85,7 @@ def jumped() -> jaxik.Result:
     """Weights go by contact, except for the last clip."""
 
     def run(by_contact: jax.Array, ground: Terrain, frames: jaxik.Frame) -> jaxik.Result:
-        effector = FoundEffector(by_contact=by_contact)
+        effector = DirectEffector(if_found=True, by_contact=by_contact)
         rules = {"contact": LabelContact(), "root": KeepRoot(), "effector": effector}
         ik = dataclasses.replace(jaxik.presets.ozz(), **rules)
         return jaxik.run(ik, to_rig(RIG), ground, frames)

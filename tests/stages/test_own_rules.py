@@ -26,7 +26,7 @@ from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.lean import SpineLean
 from jaxik.stages.lock import Hold
 from jaxik.stages.separation import FootSeparation
-from jaxik.stages.warp import NoWarp, StrideWarp
+from jaxik.stages.warp import StrideWarp
 from jaxik.world import terrain
 from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, Sensed, Slope
 from jaxik.world.skeleton import LegPose, Rig, Still, Transform
@@ -372,9 +372,9 @@ def test_a_place_on_the_ground_stays_one_whatever_the_way():
 
 
 def test_without_a_scale_there_is_no_warp():
-    for rule, scale in ((StrideWarp(), None), (NoWarp(), jnp.asarray(1.3))):
-        root = Transform.identity()
-        assert offsets(rule, jnp.zeros((2, 3)), jnp.zeros(3), scale, root) is None
+    assert (
+        offsets(StrideWarp(), jnp.zeros((2, 3)), jnp.zeros(3), None, Transform.identity()) is None
+    )
 
 
 def test_ankles_before_strides_are_scaled_are_where_the_animation_has_them():

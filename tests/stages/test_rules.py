@@ -59,6 +59,29 @@ def test_a_new_rule_has_its_defaults_and_a_present_one_keeps_its_values():
 
 
 @pytest.mark.parametrize(
+    ("preset", "stage", "name", "values"),
+    [
+        ("record", "contact", "IdleContact", {"contact.idle_speed": 0.0}),
+        ("unreal", "contact", "IdleContact", {"contact.idle_speed": 0.1}),
+        ("unreal", "contact", "StandingContact", {"contact.idle_speed": math.inf}),
+        ("stride", "warp", "NoWarp", {"warp.min_scale": 1.0, "warp.max_scale": 1.0}),
+        ("ozz", "target", "ContactTarget", {"target.max_slope": 0.0, "target.foot_height": 0.1}),
+        ("mec", "target", "ContactTarget", {"target.max_slope": 0.0, "target.foot_height": 0.085}),
+        ("mec", "target", "SoleTarget", {"target.max_slope": 1.5, "target.foot_height": 0.12}),
+        ("record", "effector", "FoundEffector", {"effector.if_found": True}),
+        ("ozz", "effector", "DirectEffector", {"effector.if_found": False}),
+        ("mec", "leg", "HintLeg", {"leg.to_hint": True}),
+    ],
+)
+def test_a_rule_that_has_been_merged_into_another_one_keeps_its_name_in_files(
+    tmp_path, preset, stage, name, values
+):
+    text = f"preset = '{preset}'\n[rules]\n{stage} = '{name}'"
+    ik, _ = parameter_files.load_system(write_parameters(tmp_path, text))
+    assert {leaf: parameter_tree.get(ik, leaf) for leaf in values} == pytest.approx(values)
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("rules = 3", "rules is 3; wanted a table"),
@@ -105,7 +128,7 @@ def test_an_experiment_can_exchange_rules_and_free_their_parameters(tmp_path):
     problem = problems.make_problem(read)
     base = problem.space.unpack(problem.space.start)
     assert type(base.pelvis) is pelvis.CapsulePelvis
-    assert type(base.contact) is contact.IdleContact
+    assert type(base.contact) is contact.StandingContact
     assert float(parameter_tree.get(base, "contact.idle_speed")) == 0.5
     assert problem.space.names == ("pelvis.speed", "foot.max_pitch")
 

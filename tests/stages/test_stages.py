@@ -208,7 +208,7 @@ CASES: dict[str, tuple[Case, ...]] = {
 WIDTHS = ("probe.min_support", "probe.support_radius")
 OVER = "probe.lift_over"  # in `test_stride`, as planes make no hurdle
 SOLES = ("probe.clearance", "probe.heel_length", "probe.toe_length")  # likewise
-SWITCHES = ("pelvis.enabled", "effector.by_contact")  # of `ozz`, too
+SWITCHES = ("pelvis.enabled", "effector.by_contact", "effector.if_found")  # of `ozz`, too
 CONSTANTS = ("probe.uneven_height", "probe.highest_step")
 IN_OWN_TESTS = {
     "record": ("warp.", "probe.max_", "probe.step_fade", "probe.layers", *WIDTHS, *SWITCHES),
