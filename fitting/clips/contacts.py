@@ -164,24 +164,30 @@ class CutOffSwing:
 
 
 def cut_off_swing(
-    ball_ws: Float64[np.ndarray, "frames 3"], stance: Bool[np.ndarray, " frames"]
+    ball_ws: Float64[np.ndarray, "frames 3"],
+    stance: Bool[np.ndarray, " frames"],
+    up_ws: Sequence[float] | np.ndarray = UP,
 ) -> CutOffSwing | None:
     """The swing of one foot that the start of a clip cuts off, as long and far as its next one.
 
-    None if there is none, or no whole one.
+    None if there is none, or no whole one. That of the clip reversed is the one that its end cuts
+    off, with its footholds exchanged.
 
     Args:
-        ball_ws: position of the foot's ball, m, y up.
+        ball_ws: position of the foot's ball, m.
         stance: True where it stands.
+        up_ws: unit, of the floor.
     """
     stances = runs(stance)
     if len(stances) < 2 or stances[0][0] == 0:
         return None
     landing, arriving = stances[0][0], stances[1][0]
     next_ws, following_ws = (np.median(ball_ws[a : b + 1], axis=0) for a, b in stances[:2])
-    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), UP)
+    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), up_ws)
     lengths = np.linalg.norm([remaining, way], axis=1)
-    ahead = remaining if lengths[0] > SHORTEST_WAY else way
+    # What little is seen of a swing that is nearly all cut off tells its direction badly.
+    hidden = max(0.0, 1.0 - lengths[0] / max(lengths[1], SHORTEST_WAY))
+    ahead = remaining + hidden * way
     back = ahead / max(float(np.linalg.norm(ahead)), 1e-9) * lengths.max()
     fraction = 1.0 - (landing - np.arange(landing)) / (arriving - stances[0][1])
     return CutOffSwing(next_ws - back, next_ws, np.maximum(fraction, 0.0))

@@ -154,7 +154,7 @@ def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(
 # Strides
 
 
-def test_strides_go_from_stance_to_stance_and_are_unknown_where_a_foot_never_stands(clip):
+def test_strides_go_from_stance_to_stance_and_are_unknown_of_a_foot_that_never_stands(clip):
     stride = jax.tree.map(np.asarray, clip_frames.frames_from_clip(clip).stride)
     stance = clip.stance_labels()
     np.testing.assert_array_equal(stride.standing, stance)
@@ -162,8 +162,7 @@ def test_strides_go_from_stance_to_stance_and_are_unknown_where_a_foot_never_sta
     balls = clip.joints_ws(3)
     for leg in range(2):
         stances = contacts.runs(stance[:, leg])
-        expected = np.arange(clip.frame_count) <= stances[-1][1]
-        np.testing.assert_array_equal(stride.known[:, leg], expected)
+        np.testing.assert_array_equal(stride.known[:, leg], 1.0)
         middles = [np.median(balls[a : b + 1, leg], axis=0) for a, b in stances]
         for n, ((first, last), (landing, _)) in enumerate(itertools.pairwise(stances)):
             here = slice(first, landing)
@@ -214,7 +213,7 @@ def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
         assert clip.with_motion(stray, clip.rotations_ws).cuts == (), fps
 
 
-# Swings that the start of a clip cuts off, against those of the whole clip
+# Swings that the start or the end of a clip cuts off, against those of the whole clip
 
 LEG = 1
 
@@ -259,6 +258,27 @@ def test_a_swing_that_is_cut_off_begins_where_the_whole_clip_shows_it(walk):
     for frames in (slice(first, None), slice(last + 5), slice(first)):
         # It starts standing, or lands once, or never.
         assert contacts.cut_off_swing(balls_ws[frames], stance[frames]) is None
+
+
+def test_a_swing_that_the_end_cuts_off_goes_on_as_in_the_whole_clip(walk):
+    leaving, landing = swing_of(walk)
+    whole = clip_frames.frames_from_clip(walk).stride
+    for part in (0.05, 0.3, 0.6, 0.95):
+        end = round(leaving + part * (landing - leaving)) + 1
+        stride = clip_frames.frames_from_clip(walk.select(np.arange(end))).stride
+        np.testing.assert_array_equal(stride.known[:, LEG], 1.0)
+        for name, near in (
+            ("last_ws", 0.0),
+            ("next_ws", 0.06),
+            ("fraction", 2 / (landing - leaving)),
+        ):
+            expected, actual = (getattr(x, name)[leaving - 5 : end, LEG] for x in (whole, stride))
+            np.testing.assert_allclose(actual, expected, rtol=0, atol=near + 1e-9, err_msg=name)
+    first, last = contacts.runs(walk.stance_labels()[:, LEG])[0]
+    for frames, known in ((np.arange(last + 5), last), (np.arange(first), -1)):
+        # No swing before it says how long and far one goes, or the foot never stands.
+        stride = clip_frames.frames_from_clip(walk.select(frames)).stride
+        np.testing.assert_array_equal(stride.known[:, LEG], frames <= known)
 
 
 def test_only_higher_ground_under_a_swing_that_is_cut_off_counts_also_after_a_teleport(walk):
