@@ -16,7 +16,6 @@ from fitting.runtime.declarations import key, keys, read
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 from jaxik.world import body
-from jaxik.world.similarity import similar
 
 from . import systems
 from .systems import DEFAULT_PRESET, Body, Preset
@@ -119,5 +118,5 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
     validation.check_keys(content, list(vars(ik)), str(path))
     ik = systems.with_parameters(ik, validation.flatten(content, 2), str(path))
     if top.leg_length is not None and rig is not None:
-        ik = similar(ik, body.leg_length(rig) / top.leg_length)
+        ik = body.similar(ik, body.leg_length(rig) / top.leg_length)
     return ik, preset

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter
-from jaxik.world.similarity import similar
+from jaxik.world.body import similar
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 

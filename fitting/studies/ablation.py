@@ -53,7 +53,7 @@ from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, error_context
-from jaxik.world.similarity import similar
+from jaxik.world.body import similar
 
 from .animations import Animation
 from .campaign import Campaign

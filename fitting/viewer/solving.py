@@ -15,7 +15,7 @@ from fitting.motion.measures import VISIBLE, Measures, PlacedMotion, Soles
 from fitting.motion.playback import stage_outputs
 from fitting.runtime.precision import in_float64
 from jaxik.world import body
-from jaxik.world.similarity import similar
+from jaxik.world.body import similar
 from jaxik.world.terrain import Hit
 
 from .session import Colour, Lines, Session, crosses, joined, lines

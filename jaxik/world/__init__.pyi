@@ -6,7 +6,6 @@ from . import grid as grid
 from . import heightfield as heightfield
 from . import live as live
 from . import places as places
-from . import similarity as similarity
 from . import skeleton as skeleton
 from . import surfaces as surfaces
 from . import terrain as terrain

@@ -12,9 +12,14 @@ over ankle height     as far over the ankle of a flat foot as the adult's number
                       `over ball height` likewise
 
 Gains, half-lives, angles and parts of a length follow nothing.
+
+Of a body of the same shape, with legs r times as long, `similar` knows all numbers by their units,
+half-lives too: lengths are r, times and speeds root r times as large, and rates the inverse of
+that. A gain per tick stays, and so keeps its half-life in ticks, which are longer.
 """
 
 import dataclasses
+import re
 from types import ModuleType
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -23,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Declaration, Follows
@@ -36,6 +41,8 @@ BALL = 0.055  # m, likewise
 FOOT = 0.12  # m, from ankle to ball
 FOOT_RANGE = 2.0  # factor by which feet may be larger or smaller than their legs say
 NOTICEABLE = 0.05  # of their mean, from which legs get values of their own
+DIMENSIONS = {"m": 1.0, "s": 0.5, "Hz": -0.5, "rad": 0.0, "tick": 0.0, "1": 0.0}  # powers of r
+POWERS = {"": 1, "²": 2, "³": 3}
 
 Tree = TypeVar("Tree", bound=eqx.Module)
 Numbers: TypeAlias = Array | np.ndarray | float
@@ -177,3 +184,37 @@ def _follow_range(end: float, follows: Follows, size: Size) -> Numbers:
             return end * np.maximum(size.ratio, size.ball / BALL)
         case _:
             return _follow(end, follows, size)
+
+
+def exponent(unit: str) -> float:
+    """The power of the ratio of leg lengths by which a number with this unit changes.
+
+    Args:
+        unit: such as "m", "rad", "1/s" or "m/s²".
+
+    Raises:
+        ValueError: the unit is made of others than these.
+    """
+    total = 0.0
+    for sign, part in zip((1, -1), unit.split("/", 1), strict=False):
+        found = re.fullmatch(r"(\w+?)([²³]?)", part)
+        if found is None or found[1] not in DIMENSIONS:
+            raise ValueError(f"the unit {unit!r} is not made of {list(DIMENSIONS)}")
+        total += sign * DIMENSIONS[found[1]] * POWERS[found[2]]
+    return total
+
+
+def similar(system: Tree, ratio: Float[Array, ""] | float) -> Tree:
+    """The system for a dynamically similar body.
+
+    It takes any tree of rules; all declared parameters and constants change, none else.
+
+    Args:
+        system: with the numbers of the first body.
+        ratio: leg length of the second body over that of the first.
+    """
+    values = {}
+    for slot in parameter_tree.slots(system):
+        if power := exponent(slot.unit):
+            values[slot.name] = slot.value * jnp.asarray(ratio, slot.value.dtype) ** power
+    return parameter_tree.replace(system, values)

@@ -31,7 +31,7 @@ from fitting.studies.many import evaluation
 from fitting.studies.many import fit_many as many_fits
 from fitting.studies.many.fit_many import plan
 from jaxik.maths import parameter_tree
-from jaxik.world import similarity
+from jaxik.world import body
 from support import scenes, small_studies
 from support.experiments import ROOT
 from support.watching import listening
@@ -262,7 +262,7 @@ def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):
     sized = eqx.tree_at(lambda s: s.size, scene, size, is_leaf=lambda leaf: leaf is None)
     knees, expected, plain = (
         np.asarray(run_alone(system, clip)[0])
-        for system, clip in ((ik, sized), (similarity.similar(ik, size), scene), (ik, scene))
+        for system, clip in ((ik, sized), (body.similar(ik, size), scene), (ik, scene))
     )
     np.testing.assert_allclose(knees, expected, rtol=1e-9)
     assert np.abs(knees - plain).max() > 0.001

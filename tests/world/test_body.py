@@ -32,8 +32,8 @@ from jaxik.maths.parameter_tree import (
 from jaxik.pipeline.shapes import check_system
 from jaxik.stages.contact import HeightContact, SpeedContact
 from jaxik.world import body, skeleton, terrain
+from jaxik.world.body import exponent, similar
 from jaxik.world.frame import rise_of
-from jaxik.world.similarity import exponent, similar
 from jaxik.world.skeleton import LegPose, Skeleton, Still, Transform, bone_lengths
 from support.bodies import scaled
 from support.clips import assert_close, make_rig, to_rig
