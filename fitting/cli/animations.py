@@ -38,7 +38,9 @@ MOTION_OUTPUT = (
 def _system(parser: argparse.ArgumentParser) -> None:
     """Adds the system that is run."""
     system = parser.add_mutually_exclusive_group()
-    system.add_argument("--preset", default="record", help="of jaxik.presets (default: record)")
+    system.add_argument(
+        "--preset", help="of jaxik.presets (default: stride, or record where a foot never stands)"
+    )
     system.add_argument("--parameters", type=Path, metavar="TOML", help="instead of a preset")
 
 
@@ -126,12 +128,11 @@ def run(options: argparse.Namespace) -> int:
     from fitting import jobs
     from fitting.experiment import parameter_files, systems
 
-    animation = _animation(options)
-    rig = animation.flat_clip.rig
+    animation, ik = _animation(options), None
     if options.parameters is not None:
-        ik, _ = parameter_files.load_system(options.parameters, rig)
-    else:
-        ik = systems.preset_system(options.preset, rig)
+        ik, _ = parameter_files.load_system(options.parameters, animation.flat_clip.rig)
+    elif options.preset is not None:
+        ik = systems.preset_system(options.preset, animation.flat_clip.rig)
     jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain)
     return 0
 
@@ -154,7 +155,7 @@ def view(options: argparse.Namespace) -> int:
     """Move parameters in the browser, and see the motion at once.
 
     jaxik view runs/walk                                      before, fitted and captured
-    jaxik view walk.bvh --terrain steps.obj --preset stride
+    jaxik view walk.bvh --terrain steps.obj
     jaxik view walk.bvh --terrain steps.obj --parameters footik.toml --port 9000
 
     Save on the page writes tuned.toml and, where it has room, the record tuned.bin; files
@@ -172,7 +173,8 @@ def view(options: argparse.Namespace) -> int:
         return 0
     folder = options.output or Path()
     check_folder(folder)
-    animation, preset, ik = _animation(options), Preset(options.preset), None
+    animation, ik = _animation(options), None
+    preset = None if options.preset is None else Preset(options.preset)
     if options.parameters is not None:
         ik, preset = load_system(options.parameters, animation.flat_clip.rig)
     session = viewer.session_of_animation(animation, preset, ik)

@@ -55,7 +55,11 @@ def _workers(default: int | None, meaning: str) -> tuple[Option, Option]:
         "--base", type=Path, nargs="+", default=[], metavar="FLAT",
         help="flat animations, one for each clip (default: made from the clips)",
     ),
-    argument("--preset", default="record", help="what is fitted (default: record)"),
+    argument(
+        "--preset",
+        help="what is fitted (default: stride; record where a foot never stands, or with "
+        "--record-only)",
+    ),
     flag("--faithful", "the original, where the preset differs from it"),
     flag("--record-only", "only what the game's record has room for"),
     output("DIR", "folder for the experiment"),
@@ -67,7 +71,7 @@ def init(options: argparse.Namespace) -> int:
     """Make an experiment of your clips that runs as it is.
 
     jaxik init walk.bvh -o walk
-    jaxik init walk.bvh stairs.bvh --terrain floor.obj stairs.obj --preset stride -o walks
+    jaxik init walk.bvh stairs.bvh --terrain floor.obj stairs.obj -o walks
     jaxik init walk.bvh --terrain ground.ply --record-only -o game
 
     Looks at the clips, reconstructs the ground where none is given, tries every parameter over
@@ -75,14 +79,18 @@ def init(options: argparse.Namespace) -> int:
     assumes, what the clips say for it, and what would be better.
     """
     from fitting import jobs
-    from fitting.experiment.systems import Preset
+    from fitting.experiment.systems import DEFAULT_PRESET, Preset
     from fitting.studies.draft import DraftRequest
+
+    preset = None
+    if options.preset is not None or options.faithful:
+        preset = Preset(options.preset or DEFAULT_PRESET.name, options.faithful)
 
     request = DraftRequest(
         clips=tuple(options.clips),
         terrains=tuple(options.terrain),
         bases=tuple(options.base),
-        preset=Preset(options.preset, options.faithful or options.record_only),
+        preset=preset,
         record_only=options.record_only,
         reading=clip_options(options),
         terrain_reading=terrain_options(options),

@@ -458,7 +458,7 @@ def apply(
 
 @in_float64
 def solve(
-    ik: jaxik.FootIK,
+    ik: jaxik.FootIK | None,
     animation: AnimationFiles,
     output: str | Path | None = None,
     *,
@@ -470,7 +470,7 @@ def solve(
     a warning, with the most likely cause of feet off the ground.
 
     Args:
-        ik: the system.
+        ik: the system; None is the preset that serves the clip best.
         animation: the clip, the terrain, and where the root is put.
         output: .npz, .bvh, .glb or .csv file for the solved clip; see `save_clip`.
         with_terrain: whether a .glb gets the terrain beside the skeleton.
@@ -484,9 +484,11 @@ def solve(
         check_clip_file(path, with_ground=with_terrain)
         if path.exists() and path.samefile(animation.clip):
             raise ValueError(f"{path}: is the clip that is read; name another file")
-    ik, loaded = with_floats(ik, np.float64), load_animation(animation)
+    loaded = load_animation(animation)
     if path is not None:
         check_clip_file(path, loaded.clip)
+    ik = ik or systems.choose_preset([loaded.clip]).system(loaded.clip.rig)
+    ik = with_floats(ik, np.float64)
     loaded.check_shapes(ik)
     began = time.perf_counter()
     with activity.announced("Compiling and running the system"):

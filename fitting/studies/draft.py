@@ -17,7 +17,7 @@ from fitting.experiment.experiment import ClipEntry, Experiment
 from fitting.experiment.problems import ClipData, load_clip_data, problem_from_clips
 from fitting.experiment.record_files import PLACES
 from fitting.experiment.schema import experiment_schema
-from fitting.experiment.systems import DEFAULT_PRESET, Preset, preset_system
+from fitting.experiment.systems import Preset, choose_preset
 from fitting.ground import coverage
 from fitting.ground.meshes import TerrainOptions
 from fitting.ground.reconstruction import Reconstruction, reconstruct
@@ -47,7 +47,7 @@ from .output import output_folder
 from .terrain_report import SCATTER
 
 FEW_STANCES = 6  # of a foot
-
+RECORD = Preset("record", faithful=True)
 
 EXPERIMENT = "experiment.toml"
 FAST, SLOW = 45.0, 30.0  # Hz: clips above the one are resampled to the other, which is enough
@@ -193,7 +193,8 @@ class DraftRequest:
     """None, one for all clips, or one for each; without any, the ground is reconstructed."""
     bases: tuple[Path, ...] = ()
     """Flat animations: none, or one for each clip."""
-    preset: Preset = DEFAULT_PRESET
+    preset: Preset | None = None
+    """None is the one that serves the clips best, or the record's with `record_only`."""
     record_only: bool = False
     """Whether only what the game's record holds may be free."""
     reading: ClipOptions = AS_FOUND
@@ -211,6 +212,12 @@ class DraftRequest:
         for clip in clips:
             clip.rig  # noqa: B018  # raises without legs
         return clips
+
+    def preset_for(self, clips: Sequence[Clip]) -> Preset:
+        """What is fitted to the captured clips."""
+        if self.record_only:
+            return RECORD
+        return self.preset or choose_preset(clips)
 
 
 @dataclass(frozen=True)
@@ -261,12 +268,13 @@ def check_request(request: DraftRequest) -> None:
         )
     if bases not in (0, clips):
         raise ValueError(f"{clips} clip(s) and {bases} base(s); wanted none, or one for each")
-    if request.record_only and request.preset.name != "record":
-        raise ValueError(f"a record is made of the preset 'record', not {request.preset.name!r}")
+    preset = request.preset or RECORD
+    if request.record_only and preset.name != RECORD.name:
+        raise ValueError(f"a record is made of the preset 'record', not {preset.name!r}")
     if request.terrain_reading != TerrainOptions() and not terrains:
         raise ValueError("there is no --terrain that the options of terrains could be for")
     request.reading.check_use((*request.clips, *request.bases), "the clips")
-    preset_system(request.preset.name, faithful=request.preset.faithful)
+    preset.system()
 
 
 def reconstruct_grounds(
@@ -306,13 +314,13 @@ def draft(
         ValueError: a file cannot be read.
     """
     entries = tuple(_entry(request, clips[i], i, ground) for i, ground in enumerate(grounds))
-    fast = any(clip.fps > FAST for clip in clips)
+    preset, fast = request.preset_for(clips), any(clip.fps > FAST for clip in clips)
     experiment = Experiment(
         path=folder / EXPERIMENT,
         clips=entries,
         free={},
-        preset=request.preset.name,
-        faithful=request.preset.faithful or request.record_only,
+        preset=preset.name,
+        faithful=preset.faithful,
         name=folder.resolve().name,
         fps=SLOW if fast else None,
         record_only=request.record_only,
@@ -331,7 +339,7 @@ def draft(
     }
     check = capture_check.check(data)
     problem = problem_from_clips(replace(experiment, free=candidates), data)
-    with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
+    with activity.announced(f"Playing the clips with {preset.name} as it comes"):
         as_it_comes = playback.play_all(ik, problem.data)
     distances = goodness.measure_distances(as_it_comes, as_it_comes)
     lines: list[str] = []
@@ -342,15 +350,15 @@ def draft(
             for name in candidates
         ]
         if distances.setbacks:
-            lines = [HARM.format(request.preset.name, describe_setback(distances.setbacks[0]))]
+            lines = [HARM.format(preset.name, describe_setback(distances.setbacks[0]))]
     else:
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
             forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
     if not (check.flat or any(forecast.moves for forecast in forecasts)):
-        lines.append(f"no parameter of {request.preset.name} moves anything in these clips")
+        lines.append(f"no parameter of {preset.name} moves anything in these clips")
     elif not (check.flat or free):
-        lines.append(f"these clips determine no parameter of {request.preset.name}")
+        lines.append(f"these clips determine no parameter of {preset.name}")
     check = replace(check, lines=(*check.lines, *lines))
     return Draft(
         experiment=replace(experiment, free=free),

@@ -156,19 +156,20 @@ def session_of_fit(
 
 @in_float64
 def session_of_animation(
-    files: AnimationFiles, preset: Preset, start: jaxik.FootIK | None = None
+    files: AnimationFiles, preset: Preset | None, start: jaxik.FootIK | None = None
 ) -> Session:
     """A flat animation on a terrain; its cost too, where the file has the captured motion.
 
     Args:
         files: the clip, the terrain, and where the root is put.
-        preset: what the sliders go back to.
+        preset: what the sliders go back to; None is the one that serves the clip best.
         start: the system to begin with; None is the preset.
 
     Raises:
         ValueError: a file cannot be read, or the system does not fit the clip.
     """
     loaded = load_animation(files)
+    preset = preset or systems.choose_preset([loaded.clip])
     names = {DEFAULT: preset.system(loaded.clip.rig)} | ({GIVEN: start} if start else {})
     starts = {name: with_floats(ik, np.float64) for name, ik in reversed(names.items())}
     if loaded.root.rise is not None:

@@ -288,6 +288,7 @@ def on_hill(tmp_path_factory) -> list:
 def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_path, capsys):
     run(*on_hill, tmp_path / "out.npz")
     output = capsys.readouterr()
+    assert "preset stride, as all feet stand in turn; --preset takes another\n" in output.out
     assert re.search(r"^root: on the ground below it, 0 to \d+ cm above its", output.out, re.M)
     assert re.search(
         r"^penetration of standing feet, % of frames +[01]\.\d$", output.out, re.MULTILINE

@@ -15,7 +15,7 @@ import trimesh
 from fitting import jobs
 from fitting.cli import main
 from fitting.clips import load_clip, save_clip
-from fitting.experiment import experiment_files, problems
+from fitting.experiment import experiment_files, problems, systems
 from fitting.experiment.experiment import DEFAULT_SIGMAS, ClipEntry
 from fitting.experiment.problems import load_clip_data
 from fitting.experiment.schema import experiment_schema
@@ -121,6 +121,23 @@ def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monke
     assert experiment.fps == (30.0 if clip.fps > 45 else None)
     assert main.main(words) == 2
     assert "experiment.toml: is there already; name another folder" in capsys.readouterr().err
+
+
+def test_legs_that_walk_get_stride_and_those_that_never_stand_record():
+    clip, lines = load_clip(BASE), []
+    stance = clip.stance_labels().copy()
+    stance[:, 1] = False
+    rides = dataclasses.replace(clip, stance=stance)
+    with listening(lines.append):
+        chosen = [systems.choose_preset(clips) for clips in ([clip], [rides], [clip, rides])]
+    assert [preset.name for preset in chosen] == ["stride", "record", "record"]
+    assert lines[0] == "preset stride, as all feet stand in turn; --preset takes another"
+    assert lines[1] == lines[2] == "preset record, as a foot never stands; --preset takes another"
+    named = DraftRequest((WALK,), preset=Preset("ozz"))
+    assert named.preset_for([clip]).name == "ozz"
+    assert DraftRequest((WALK,)).preset_for([clip]).name == "stride"
+    only = dataclasses.replace(named, preset=None, record_only=True)
+    assert only.preset_for([clip]) == Preset("record", faithful=True)
 
 
 def test_of_two_parameters_that_do_the_same_only_one_is_free():
