@@ -1,7 +1,7 @@
 """The pipeline: a system of thirteen rules, and how frames of animation go through it.
 
 Everything here is for one character; batch with `jaxik.lanes` or `jax.vmap`. Start with
-`system.FootIK`, then `simulation.step`, which has the order of all stages, and `phases`.
+`system.FootIK`, then `phases.solve`, which is the whole algorithm.
 """
 
 import lazy_loader

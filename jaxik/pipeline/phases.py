@@ -1,110 +1,41 @@
-"""The three phases of a frame: `sense`, `advance` and `pose`.
+"""The algorithm of foot IK: `solve`, and its three phases `sense`, `advance` and `pose`.
 
 `sense` and `pose` have no memory, so that a clip's frames are computed all at once; only `advance`
 has to run frame by frame. Contact and root are sensed and advanced before everything else, and so
-is what the probe remembers.
+is what the probe remembers. How frames are fed in is no part of the algorithm: see `frames`.
 """
 
 import dataclasses
 import functools
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, vec
-from jaxik.maths.struct import struct
-from jaxik.stages.contact import AbstractContact
-from jaxik.stages.inputs import Inputs, Moment, SensedMoment
+from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.leg import LegGoal
 from jaxik.stages.pelvis import PelvisMoment
-from jaxik.stages.probe import AbstractProbe, foot_heading
-from jaxik.stages.root import AbstractRoot
-from jaxik.world.frame import Contact, Frame, Sensed, Stride, animated_ankles
-from jaxik.world.places import centre_about
-from jaxik.world.skeleton import Rig, Transform, bone_lengths, mean_position
+from jaxik.stages.probe import foot_heading
+from jaxik.world.frame import Contact, Sensed, Stride, animated_ankles
+from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
-from .centring import in_world, recentred
-from .faults import Faults, per_leg, remembered
-from .system import Advanced, Corrections, FootIK, Result, State, Trace, restarted
-from .tracks import Tracks, system_at
+from .centring import in_world
+from .faults import Faults
+from .frames import AbstractFrames
+from .system import Advanced, Corrections, FootIK, Result, State, Trace
 
 
-@struct
-class _FirstMemory:
-    """Memory of a stage that runs before everything else."""
-
-    started: Bool[Array, ""]
-    centre_ws: Float[Array, "3"]
-    memory: PyTree
-
-
-def sense_first(
-    stage: Literal["contact", "root", "probe"],
-    ik: FootIK,
-    state: State,
-    inputs: Inputs,
-    faults: Faults | None,
-    tracks: Tracks,
-    contacts: Contact | None = None,
-) -> tuple[PyTree, PyTree]:
-    """A stage whose memory advances before everything else, for a whole clip.
-
-    It has a scan of its own, or none if its rule has no memory. Of the probe, this is the stride
-    by which it then senses the ground.
-
-    Args:
-        stage: its name.
-        ik: the system.
-        state: memory before the clip.
-        inputs: the leaves of `frame` have a leading axis of frames.
-        faults: of the frames; None takes all of them.
-        tracks: parameters that change along the clip.
-        contacts: which feet stand in each frame; for the probe.
-
-    Returns:
-        The stage's memory after each frame, and what it returns for each.
-    """
-    frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
-
-    def rule_at(at: Tracks) -> AbstractContact | AbstractRoot | AbstractProbe:
-        return getattr(system_at(ik, at), stage)
-
-    def sense_frame(frame: Frame, at: Tracks, contact: Contact | None) -> PyTree:
-        rule = rule_at(at)
-        if isinstance(rule, AbstractProbe):
-            assert contact is not None
-            return watch(system_at(ik, at), inputs.at(frame), contact)
-        return rule.sense(inputs.at(frame))
-
-    sensed = jax.vmap(sense_frame)(frames, tracks, contacts)
-    if not jax.tree.leaves(memory):
-
-        def advanced(sensed: PyTree, dt: Array, at: Tracks) -> PyTree:
-            return rule_at(at).advance(Moment(dt, state.started, gate), sensed, memory)[1]
-
-        return memory, jax.vmap(advanced)(sensed, frames.dt, tracks)
-
-    def scanned(before: _FirstMemory, frame: tuple) -> tuple[_FirstMemory, tuple]:
-        sensed, dt, centre_ws, faulty, at, restart = frame
-        before = restarted(before, fresh, restart)
-        before = recentred(before, centre_ws, inputs.terrain, faulty)
-        now = Moment(dt, before.started, gate)
-        memory, output = rule_at(at).advance(now, sensed, before.memory)
-        after = _FirstMemory(jnp.ones_like(before.started), before.centre_ws, memory)
-        after = remembered(now, before, after, of_legs, faulty)
-        return after, (after.memory, output)
-
-    def begin(rig: Rig) -> _FirstMemory:
-        started, centre_ws = (jnp.zeros_like(x) for x in (state.started, state.centre_ws))
-        return _FirstMemory(started, centre_ws, getattr(ik, stage).init(rig))
-
-    fresh, of_legs = begin(inputs.rig), faults and per_leg(begin, inputs.rig)
-    centres = centre_about(frames.world_from_model.pos)
-    clip = (sensed, frames.dt, centres, faults, tracks, frames.restart)
-    return jax.lax.scan(scanned, _FirstMemory(state.started, state.centre_ws, memory), clip)[1]
+def solve(frames: AbstractFrames) -> tuple[State, Result]:
+    """Memory after the last frame, and the result of each."""
+    contact = frames.ahead("contact", lambda ik, inputs: ik.contact.sense(inputs))
+    root = frames.ahead("root", lambda ik, inputs: ik.root.sense(inputs))
+    probe = frames.ahead("probe", watch, contact.output)
+    sensed = frames.each(sense, contact.output, root.output, probe.output)
+    ahead = contact.state, root.state, probe.state
+    after, advanced = frames.advance(advance, sensed, ahead)
+    return after, frames.each(pose, sensed, advanced, frames.faults)
 
 
 def watch(ik: FootIK, inputs: Inputs, contact: Contact) -> PyTree:
@@ -186,7 +117,7 @@ def sense(
 
 
 def advance(
-    ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, PyTree, PyTree]
+    ik: FootIK, now: SensedMoment, state: State, ahead: tuple[PyTree, PyTree, PyTree]
 ) -> Advanced:
     """Memory after this frame, and the outputs of the stages that have some.
 
@@ -194,7 +125,7 @@ def advance(
         ik: the system.
         now: the sensed frame.
         state: memory after the frame before.
-        first: memory of contact, root and probe after this frame: they advance before `sense`.
+        ahead: memory of contact, root and probe after this frame.
     """
     sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
@@ -226,16 +157,17 @@ def advance(
     with jax.named_scope("effector"):
         effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
     with jax.named_scope("fade"):
+        # All that a leg's weight consists of: frame and leg (`Sensed.weight`), its contact, how far
+        # these have faded in, and the effector's own part. A faulty leg has none (`pose`).
         standing = jnp.where(ik.effector.by_contact, sensed.contact.weight, 1.0)
-        wanted = sensed.weight * standing
-        fade_state, weight = ik.fade.legs(now, effector, body, wanted, fade_state)
-        effector = dataclasses.replace(effector, weight=effector.weight * weight)
+        fade_state, faded = ik.fade.legs(now, effector, body, sensed.weight * standing, fade_state)
+        effector = dataclasses.replace(effector, weight=faded * effector.weight)
     after = State(
         started=jnp.ones_like(now.started),
         centre_ws=state.centre_ws,
-        contact=first[0],
-        root=first[1],
-        probe=first[2],
+        contact=ahead[0],
+        root=ahead[1],
+        probe=ahead[2],
         target=target_state,
         lean=lean_state,
         lock=lock_state,

@@ -3,36 +3,25 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TypeAlias, TypeVar, cast
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
 
 from jaxik.maths.gate import HARD, AbstractGate
-from jaxik.stages.inputs import Inputs, Moment, SensedMoment
-from jaxik.world.frame import Frame, Sensed
-from jaxik.world.places import centre_about
-from jaxik.world.skeleton import Rig, Transform
+from jaxik.stages.inputs import Inputs
+from jaxik.world.frame import Frame
+from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import LegTerrains, Terrain
 
-from .centring import recentred
-from .faults import Faults, clean, per_leg, remembered
-from .phases import advance, pose, sense, sense_first, watch
+from .faults import Faults, clean
+from .frames import Clip, OneFrame
+from .phases import solve
 from .shapes import check_inputs, check_state, with_floats_of
-from .system import Advanced, FootIK, Result, State, fresh_memory, init, restarted
-from .tracks import Tracks, read_tracks, system_at
+from .system import FootIK, Result, State, init
+from .tracks import Tracks, read_tracks
 
 Function = TypeVar("Function", bound=Callable[..., object])
-ScannedFrame: TypeAlias = tuple[
-    Sensed,
-    tuple[PyTree, PyTree, PyTree],
-    Transform,
-    Array | None,
-    Faults | None,
-    Tracks,
-    Array | None,
-]
 
 
 def _jit(**options: str | tuple[str, ...]) -> Callable[[Function], Function]:
@@ -77,32 +66,7 @@ def step(
     """
     inputs = Inputs(rig, terrain, frame, gate)
     check_inputs(ik, inputs, clip=False)
-    fresh = init(ik, rig)
-    check_state(state, fresh)
-    ik, rig, terrain, state, frame, gate = with_floats_of(
-        rig, (ik, rig, terrain, state, frame, gate)
-    )
-    inputs = Inputs(rig, terrain, frame, gate)
-    faults = None
-    if not checked:
-        frame, faults = clean(frame, rig.present)
-    inputs = inputs.at(frame, faults and faults.legs)
-    state = restarted(state, fresh, frame.restart)
-    state = recentred(state, inputs.centre_ws, terrain, faults)
-    now = Moment(frame.dt, state.started, gate)
-    with jax.named_scope("contact"):
-        contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
-    with jax.named_scope("root"):
-        root_state, rise = ik.root.advance(now, ik.root.sense(inputs), state.root)
-    with jax.named_scope("probe"):
-        probe_state, stride = ik.probe.advance(now, watch(ik, inputs, contact), state.probe)
-    sensed = sense(ik, inputs, contact, rise, stride)
-    sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, inputs.terrain)
-    advanced = advance(ik, sensed_now, state, (contact_state, root_state, probe_state))
-    of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
-    after = remembered(now, state, advanced.state, of_legs, faults)
-    advanced = dataclasses.replace(advanced, state=after)
-    result = pose(ik, inputs, sensed, advanced, faults)
+    after, result = solve(OneFrame.after(*_start(ik, inputs, state, checked)))
     return after, result if trace else dataclasses.replace(result, trace=None)
 
 
@@ -135,49 +99,21 @@ def resume(
     """
     inputs = Inputs(rig, terrain, frames, gate)
     check_inputs(ik, inputs, clip=True)
-    fresh = init(ik, rig)
-    check_state(state, fresh)
-    ik, rig, terrain, state, frames, gate = with_floats_of(
-        rig, (ik, rig, terrain, state, frames, gate)
-    )
-    inputs = Inputs(rig, terrain, frames, gate)
     values = read_tracks(ik, tracks, frames.dt.shape[0], rig.side.shape[0])
-    faults = None
-    if not checked:
-        frames, faults = clean(frames, rig.present)
-        inputs = dataclasses.replace(inputs, frame=frames)
-    faulty = faults and faults.legs
-    with jax.named_scope("contact"):
-        contact_states, contacts = sense_first("contact", ik, state, inputs, faults, values)
-    with jax.named_scope("root"):
-        root_states, rises = sense_first("root", ik, state, inputs, faults, values)
-    with jax.named_scope("probe"):
-        probe_states, strides = sense_first("probe", ik, state, inputs, faults, values, contacts)
-    sensed = jax.vmap(
-        lambda frame, faulty, at, *first: sense(system_at(ik, at), inputs.at(frame, faulty), *first)
-    )(frames, faulty, values, contacts, rises, strides)
-    of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
+    return solve(Clip(*_start(ik, inputs, state, checked), values))
 
-    def scanned(state: State, frame: ScannedFrame) -> tuple[State, Advanced]:
-        sensed, first, platforms, centre_ws, faults, at, restart = frame
-        state = restarted(state, fresh, restart)
-        state = recentred(state, centre_ws, terrain, faults)
-        ground = inputs.ground(platforms, centre_ws)
-        now = SensedMoment(sensed.dt, state.started, gate, sensed, ground)
-        advanced = advance(system_at(ik, at), now, state, first)
-        after = remembered(now, state, advanced.state, of_legs, faults)
-        return after, dataclasses.replace(advanced, state=after)
 
-    first = (contact_states, root_states, probe_states)
-    centres = centre_about(frames.world_from_model.pos)
-    clip = (sensed, first, frames.platforms, centres, faults, values, frames.restart)
-    after, advanced = jax.lax.scan(scanned, state, clip)
-    result = jax.vmap(
-        lambda frame, faults, s, a, at: pose(
-            system_at(ik, at), inputs.at(frame, faults and faults.legs), s, a, faults
-        )
-    )(frames, faults, sensed, advanced, values)
-    return after, result
+def _start(
+    ik: FootIK, inputs: Inputs, state: State, checked: bool
+) -> tuple[FootIK, Inputs, State, Faults | None, State]:
+    """All in the rig's floats and with sound frames, where these were not, and a fresh memory."""
+    fresh = init(ik, inputs.rig)
+    check_state(state, fresh)
+    ik, inputs, state = with_floats_of(inputs.rig, (ik, inputs, state))
+    if checked:
+        return ik, inputs, state, None, fresh
+    frame, faults = clean(inputs.frame, inputs.rig.present)
+    return ik, dataclasses.replace(inputs, frame=frame), state, faults, fresh
 
 
 @_jit(static_argnames=("block", "checked"))

@@ -9,7 +9,8 @@ import pytest
 
 import jaxik
 from jaxik.maths import parameter_tree
-from jaxik.pipeline.phases import sense_first
+from jaxik.pipeline.frames import Clip
+from jaxik.pipeline.phases import watch
 from jaxik.stages.effector import DirectEffector
 from jaxik.stages.foot import KeepFoot
 from jaxik.stages.inputs import Inputs
@@ -59,7 +60,7 @@ def foreseen(
     state = jaxik.init(ik, to_rig(RIG))
     if memory is not None:
         state = dataclasses.replace(state, started=jnp.ones((), bool), probe=memory)
-    return sense_first("probe", ik, state, inputs, None, {}, contacts)
+    return Clip(ik, inputs, state, None, state, {}).ahead("probe", watch, contacts)
 
 
 def test_nothing_changes_on_a_flat_floor():

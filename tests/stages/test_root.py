@@ -13,7 +13,7 @@ import fitting
 import jaxik
 from fitting.ground import ground_path
 from fitting.synthetic import walker
-from jaxik.pipeline.phases import sense_first
+from jaxik.pipeline.frames import Clip
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.root import AbstractRoot, GroundRoot, KeepRoot
 from jaxik.world import terrain
@@ -40,7 +40,9 @@ def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> j
     """How far the rule moves the root in each frame, m."""
     rig, ik = walk().rig, dataclasses.replace(jaxik.presets.record(), root=rule)
     inputs = Inputs(rig, ground, clip, jaxik.HARD)
-    return sense_first("root", ik, jaxik.init(ik, rig), inputs, faults=None, tracks={})[1]
+    state = jaxik.init(ik, rig)
+    clip_frames = Clip(ik, inputs, state, None, state, {})
+    return clip_frames.ahead("root", lambda ik, inputs: ik.root.sense(inputs)).output
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import pytest
 
 import jaxik
 from jaxik import HARD
-from jaxik.pipeline.phases import sense_first
+from jaxik.pipeline.frames import Clip
 from jaxik.stages import foot
 from jaxik.stages.contact import SpeedState
 from jaxik.stages.effector import BodyEffector, BodyState
@@ -64,7 +64,8 @@ def sense(
     if memory is not None:
         state = dataclasses.replace(state, started=jnp.ones((), bool), contact=memory)
     inputs = Inputs(rig, LEVEL, frames, jaxik.HARD)
-    return sense_first("contact", ik, state, inputs, None, {})
+    clip = Clip(ik, inputs, state, None, state, {})
+    return clip.ahead("contact", lambda ik, inputs: ik.contact.sense(inputs))
 
 
 def test_a_foot_between_the_thresholds_stays_as_it_was_and_swings_in_the_first_frame():
