@@ -191,7 +191,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         separation=NoSeparation(),
         pelvis=LegLengthPelvis(),
         effector=FadeEffector(),
-        leg=PoleLeg(to_hint=True),
+        leg=PoleLeg(to_hint=True, allow_stretch=True),
         foot=FlatFoot(),
         fade=NoFade() if faithful else SpeedFade(),
     )
@@ -207,7 +207,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             lock=PlantLock(release_distance=0.15, release_angle=0.5),
             pelvis=LegLengthPelvis(max_length=body.LEG),
             separation=FootSeparation(),
-            leg=PoleLeg(),
+            leg=PoleLeg(allow_stretch=True),
         )
     return body.scale(ik, rig)
 

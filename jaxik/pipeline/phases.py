@@ -205,7 +205,7 @@ def pose(
     spine, head = (
         None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
-    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head)
+    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch)
     advanced_ws = dataclasses.replace(in_world(inputs, advanced), state=advanced.state)
     trace = Trace(in_world(inputs, sensed), advanced_ws)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)

@@ -111,6 +111,9 @@ class Corrections:
     """None if the lean rule does not bend the spine."""
     head: Float[Array, "*b 4"] | None = None
     """None likewise."""
+    stretch: Float[Array, "*b legs"] | None = None
+    """Not a rotation: the length of thigh and shin as a multiple of the animated one. None if the
+    leg rule stretches none."""
 
 
 @struct

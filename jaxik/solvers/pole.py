@@ -7,7 +7,7 @@ from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import struct
 
-from .reach import LENGTH_BAND, quartic_limit
+from .reach import LENGTH_BAND, quartic_limit, stretch_to
 from .rotations import DOWN, angle_about, safe_arc
 from .two_bone import Limb, LimbBend, triangle_half_angle
 
@@ -24,7 +24,13 @@ class PoleTarget:
     """rad, about the target's direction, applied last."""
 
 
-def bend_to_pole(limb: Limb, target: PoleTarget, soften: Array, gate: AbstractGate) -> LimbBend:
+def bend_to_pole(
+    limb: Limb,
+    target: PoleTarget,
+    soften: Array,
+    gate: AbstractGate,
+    max_stretch: Array | None = None,
+) -> LimbBend:
     """Bends a limb to its target in the plane that contains the pole.
 
     The triangle is made of the whole lengths of the bones: unlike with `hinge_half_angle`, a hinge
@@ -41,15 +47,22 @@ def bend_to_pole(limb: Limb, target: PoleTarget, soften: Array, gate: AbstractGa
         soften: fraction of the bones' length up to which the ankle reaches its target; beyond, it
             falls short (`quartic_limit`). Clipped to 0..1.
         gate: decides `reached`.
+        max_stretch: how long bones may become for a target out of reach, as a multiple of what they
+            are; None leaves them.
     """
     to_hip, to_ankle, hinge = limb.to_hip, limb.to_ankle, limb.hinge
     a2, b2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
     thigh, shin = vec.safe_sqrt(a2), vec.safe_sqrt(b2)
     distance = vec.length(target.to_target)
     free = jnp.where(soften < 0, 0.0, jnp.where(soften > 1, 1.0, soften)) * (thigh + shin)
-    reach = quartic_limit(distance, free, thigh + shin)
+    farthest, nearer, stretch = free, distance, None
+    if max_stretch is not None:
+        stretch = stretch_to(distance, free, max_stretch, gate)
+        # The angles of a longer limb are those of the limb as it is with a nearer target.
+        farthest, nearer = free * max_stretch, distance / stretch
+    reach = quartic_limit(nearer, free, thigh + shin)
     too_near = gate.below(distance, jnp.abs(thigh - shin), band=LENGTH_BAND)
-    reached = (1.0 - too_near) * gate.below(distance, free, band=LENGTH_BAND)
+    reached = (1.0 - too_near) * gate.below(distance, farthest, band=LENGTH_BAND)
 
     # The normal of a bent limb: one part along the hinge, and one across it if the hinge is tilted.
     normal = vec.dot(hinge, vec.cross(to_hip, to_ankle))
@@ -62,7 +75,7 @@ def bend_to_pole(limb: Limb, target: PoleTarget, soften: Array, gate: AbstractGa
     )
 
     bent = quat.rotate(quat.from_half_angle(hinge, half_cos, half_sin), to_ankle) - to_hip
-    return LimbBend(_pole_swing(bent, hinge, target), half_cos, half_sin, reached)
+    return LimbBend(_pole_swing(bent, hinge, target), half_cos, half_sin, reached, stretch)
 
 
 def _pole_swing(bent: Array, hinge: Array, target: PoleTarget) -> Array:

@@ -4,8 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import vec
+from jaxik.maths.gate import AbstractGate
 
 LENGTH_BAND = 0.005  # m over which a blurred decision about lengths changes
+STRETCH_BAND = 0.01
 
 
 def third_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
@@ -18,6 +20,19 @@ def third_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
         cos: cosine of the angle between them.
     """
     return vec.safe_sqrt(a2 + b2 - 2.0 * ab * cos)
+
+
+def stretch_to(distance: Array, free: Array, most: Array, gate: AbstractGate) -> Array:
+    """By how much a limb's bones are longer than they are, so that it reaches a target.
+
+    Args:
+        distance: of the target, m.
+        free: how far the limb reaches freely, m; one that reaches nowhere is not stretched.
+        most: the longest that bones may be, as a multiple of what they are.
+        gate: how that is limited.
+    """
+    ratio = vec.safe_divide(distance, free, otherwise=1.0)
+    return gate.clip(ratio, jnp.ones_like(ratio), most, band=STRETCH_BAND)
 
 
 def soft_limit(x: Array, free: Array, limit: Array) -> Array:

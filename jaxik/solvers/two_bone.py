@@ -38,6 +38,8 @@ class LimbBend:
     half_sin: Float[Array, "*k"]
     reached: Float[Array, "*r"]
     """1 where the ankle can be at the target, else 0."""
+    stretch: Float[Array, "*s"] | None = None
+    """Length of both bones as a multiple of what it was; None for 1."""
 
 
 def hinge_half_angle(limb: Limb, reach: Array) -> tuple[Array, Array]:

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Declared, Leaf, Rule, angle, length, ratio, switch
+from jaxik.maths.parameter_tree import Declared, Leaf, Rule, angle, length, option, ratio, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.pole import PoleTarget, bend_to_pole
-from jaxik.solvers.reach import LENGTH_BAND, soft_limit, third_side
+from jaxik.solvers.reach import LENGTH_BAND, soft_limit, stretch_to, third_side
 from jaxik.solvers.rotations import local_correction
 from jaxik.solvers.two_bone import Limb, LimbBend, hinge_half_angle, swing_rotation
 from jaxik.world.frame import Sensed
@@ -37,6 +37,8 @@ class SolvedLeg:
     """Local correction, right-multiplied."""
     reached: Float[Array, " legs"]
     """1 where the ankle is at its target, else 0."""
+    stretch: Float[Array, " legs"] | None = None
+    """Length of thigh and shin as a multiple of the animated one; None for 1."""
 
 
 @struct
@@ -62,6 +64,27 @@ class AbstractLeg(Rule):
         """The legs with their ankles at their targets."""
 
 
+class AbstractTwoBoneLeg(AbstractLeg):
+    """Turns two bones; with `allow_stretch` on, it makes them longer where they are too short.
+
+    A target further away than `soften` times the leg's reach is reached by longer bones, both by
+    the same factor, up to `max_stretch`; the knee stays as bent as it is there. Mecanim has such a
+    *Leg Stretch* for humanoids, whose formula is not published, and Unreal's two-bone IK too.
+    """
+
+    max_stretch: Leaf = ratio(
+        1.05, 1, 1.3, "Length of a stretched leg's bones, at most, as a multiple of the animated one."
+    )
+    allow_stretch: bool = option(
+        False, "Whether bones of legs are stretched to targets out of reach."
+    )
+
+    @property
+    def longest(self) -> Array | None:
+        """How long bones may become, as a multiple of what they are; None leaves them."""
+        return self.max_stretch if self.allow_stretch else None
+
+
 def _soften_parameter(default: float, low: float) -> Declared:
     doc = "Part of its reach beyond which a leg slows down instead of snapping straight."
     return ratio(default, low, 1, doc)
@@ -77,7 +100,7 @@ def _weight_parameter() -> Declared:
     return ratio(1, 0, 1, doc)
 
 
-class TwoBone(AbstractLeg):
+class TwoBone(AbstractTwoBoneLeg):
     """Turns the knee about its hinge until the ankle is as far as the target, then swings the hip.
 
     This is exact for hinges that are not perpendicular to the leg: lengths are split into parts
@@ -110,15 +133,19 @@ class TwoBone(AbstractLeg):
         pose, target_ms = goal.pose, goal.target_ms
         limb = limb_of(rig, pose)
         to_target = vec.subtract(target_ms, pose.hip.pos)
-        reach, reached = vec.stacked_barrier(*self._reach(limb, to_target, gate))
+        reach, reached, stretch = self._reach(limb, to_target, gate)
+        reach, reached = vec.stacked_barrier(reach, reached)
         half_cos, half_sin = hinge_half_angle(limb, reach)
         knee_rot = quat.from_half_angle(limb.hinge, half_cos, half_sin)
         bent = quat.rotate(knee_rot, limb.to_ankle) - limb.to_hip
         swing = swing_rotation(bent, to_target, limb.hinge, self.twist)
-        return bend_leg(rig, goal, LimbBend(swing, half_cos, half_sin, reached))
+        return bend_leg(rig, goal, LimbBend(swing, half_cos, half_sin, reached, stretch))
 
-    def _reach(self, limb: Limb, to_target: Array, gate: AbstractGate) -> tuple[Array, Array]:
-        """Distance from hip to ankle within the limits, m, and 1 where it is the target's."""
+    def _reach(
+        self, limb: Limb, to_target: Array, gate: AbstractGate
+    ) -> tuple[Array, Array, Array | None]:
+        """Distance from hip to ankle before bones stretch, m; 1 where the target is in reach; and
+        by how much they stretch."""
         to_hip, to_ankle = limb.to_hip, limb.to_ankle
         animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
         thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
@@ -134,14 +161,17 @@ class TwoBone(AbstractLeg):
         longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
         free = jnp.where(self.as_animated & (animated > free), animated, free)
         shortest = jnp.where(self.as_animated & (animated < shortest), animated, shortest)
-        allowed = gate.clip(
-            soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND
-        )
+        farthest, nearer, stretch = free, distance, None
+        if self.longest is not None:
+            stretch = stretch_to(distance, free, self.longest, gate)
+            # The angles of a longer limb are those of the limb as it is with a nearer target.
+            farthest, nearer = free * self.longest, distance / stretch
+        allowed = gate.clip(soft_limit(nearer, free, longest), shortest, longest, band=LENGTH_BAND)
         inside = gate.above(distance, shortest, band=LENGTH_BAND)
-        return allowed, inside * gate.below(distance, free, band=LENGTH_BAND)
+        return allowed, inside * gate.below(distance, farthest, band=LENGTH_BAND), stretch
 
 
-class PoleLeg(AbstractLeg):
+class PoleLeg(AbstractTwoBoneLeg):
     """ozz's two-bone job: the leg's plane contains a pole, here that of the animated knee.
 
     That pole is perpendicular to hinge and shin: the knee's y axis in a rig whose x axis points
@@ -171,7 +201,8 @@ class PoleLeg(AbstractLeg):
         pole = jnp.where(to_hint, hint - goal.pose.hip.pos, own_pole)
         target = PoleTarget(goal.target_ms - goal.pose.hip.pos, pole, self.twist)
         goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
-        return bend_leg(inputs.rig, goal, bend_to_pole(limb, target, self.soften, inputs.gate))
+        bend = bend_to_pole(limb, target, self.soften, inputs.gate, self.longest)
+        return bend_leg(inputs.rig, goal, bend)
 
 
 def is_full(weight: Array) -> Array:
@@ -187,16 +218,20 @@ def limb_of(rig: Rig, pose: LegPose) -> Limb:
 
 
 def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
-    """The legs with knees and hips rotated as `bend` says, each by the goal's weight."""
+    """The legs with knees, hips and bones as `bend` says, each by the goal's weight."""
     pose, weight = goal.pose, goal.weight
     limb = limb_of(rig, pose)
+    thigh, shin, stretch = -limb.to_hip, limb.to_ankle, bend.stretch
+    if stretch is not None:
+        stretch = 1.0 + weight * (stretch - 1.0)
+        thigh, shin = vec.scale(thigh, stretch), vec.scale(shin, stretch)
     half_cos, half_sin = quat.nlerp_half(bend.half_cos, bend.half_sin, weight)
     knee_rot = quat.from_half_angle(limb.hinge, half_cos, half_sin)
     swing = quat.nlerp_identity(bend.swing, weight)
 
-    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -limb.to_hip))
+    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, thigh))
     shin_rot = quat.multiply(swing, knee_rot)
-    ankle_pos = vec.add(knee_pos, quat.rotate(shin_rot, limb.to_ankle))
+    ankle_pos = vec.add(knee_pos, quat.rotate(shin_rot, shin))
     ankle = Transform(ankle_pos, quat.multiply(shin_rot, pose.ankle.rot))
     solved = LegPose(
         Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
@@ -212,4 +247,5 @@ def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
         local_correction(pose.hip.rot, swing),
         quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),
         bend.reached * is_full(weight),
+        stretch,
     )
