@@ -13,7 +13,7 @@ from jaxik.maths.parameter_tree import Leaf, Rule, half_life, speed, switch, thr
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import rise_of
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import cast
+from jaxik.world.terrain import Hit, cast
 
 from .inputs import Inputs, Moment
 
@@ -104,7 +104,8 @@ class GroundRoot(AbstractRoot):
     A roof over the character, or the bench on which it sits, is ground too, but none that carries
     it: of the highest ground and the highest that is at most `max_step` above where the game has
     the character, that counts which is nearer to where the character was, at the start to where the
-    game has it. With a half-life of 0, as in ozz, the highest counts.
+    game has it; ahead, that which is nearer to the ground here. With a half-life of 0, as in ozz,
+    the highest counts.
 
     Without ground, in the air, or with `enabled` off, the character stays as far from where the
     game has it as it was.
@@ -137,30 +138,43 @@ class GroundRoot(AbstractRoot):
         return RootState(zero, zero, zero)
 
     def sense(self, inputs: Inputs) -> tuple[RootGround, RootGround]:
-        lower = jnp.where(self.max_step < self.ray_up, self.max_step, self.ray_up)
-        return self._ground(inputs, self.ray_up), self._ground(inputs, lower)
-
-    def _ground(self, inputs: Inputs, ray_up: Array) -> RootGround:
-        """The ground below a height over the origin, m."""
-        frame, gate, up = inputs.frame, inputs.gate, inputs.terrain.up_ws
+        frame, up = inputs.frame, inputs.terrain.up_ws
         origin = frame.world_from_model.pos
         # Of a critically damped spring behind a ramp, s; each frame moves to its own end.
         lag = self.half_life / smoothing.LN2 - 0.5 * frame.dt
         lag = jnp.where(lag > 0, lag, 0.0)
         travel = vec.scale(vec.reject(frame.velocity_ws, up), lag)
+        lower = jnp.where(self.max_step < self.ray_up, self.max_step, self.ray_up)
+        starts = jnp.stack([self.ray_up, lower])[:, None]
         points = jnp.stack([origin, origin + travel])
-        above = points + vec.scale(up, ray_up)
-        hits = cast(inputs.terrain.body, above, ray_up + self.ray_down, self.layers)
-        hit = jax.tree.map(lambda leaf: leaf[0], hits)
-        height, ahead = vec.unstack(vec.dot(hits.point, up))
-        step = jnp.abs(ahead - height) - vec.length(travel)
-        counts = hits.found[1] * gate.below(step, self.max_step, band=HEIGHT_BAND)
-        ahead = gate.choose(counts, ahead, height)
-        speed = vec.safe_divide(ahead - height, lag)
+        reaches = starts + self.ray_down + jnp.zeros(2, origin.dtype)
+        hits = cast(inputs.terrain.body, points + vec.scale(up, starts), reaches, self.layers)
+        ahead = jax.tree.map(lambda leaf: leaf[:, 1], hits)
+
+        def below(ray: int) -> RootGround:
+            here = jax.tree.map(lambda leaf: leaf[ray, 0], hits)
+            return self._ground(inputs, here, ahead, travel, lag)
+
+        return below(0), below(1)
+
+    def _ground(
+        self, inputs: Inputs, hit: Hit, ahead: Hit, travel: Array, lag: Array
+    ) -> RootGround:
+        """The ground at a hit below the character, which goes on at the nearer of those ahead."""
+        frame, gate, up = inputs.frame, inputs.gate, inputs.terrain.up_ws
+        height, heights = vec.dot(hit.point, up), vec.dot(ahead.point, up)
+        away = jnp.abs(heights - height)
+        nearer = ahead.found[1] * gate.below(away[1], away[0] - HEIGHT_BAND, band=HEIGHT_BAND)
+        there, found = (gate.choose(nearer, x[1], x[0]) for x in (heights, ahead.found))
+        step = jnp.abs(there - height) - vec.length(travel)
+        counts = found * gate.below(step, self.max_step, band=HEIGHT_BAND)
+        there = gate.choose(counts, there, height)
+        speed = vec.safe_divide(there - height, lag)
         on_ground = gate.above(frame.grounded, jnp.full_like(height, 0.5), band=WEIGHT_BAND)
         found = jnp.where(self.enabled, hit.found * on_ground, 0.0)
         rise = rise_of(frame.carry(hit), hit.point, up)
-        return RootGround(vec.dot(origin, up), height, ahead, speed, rise, found)
+        origin = vec.dot(frame.world_from_model.pos, up)
+        return RootGround(origin, height, there, speed, rise, found)
 
     def advance(
         self, now: Moment, sensed: tuple[RootGround, RootGround], state: RootState

@@ -146,6 +146,17 @@ def test_a_ledge_or_a_wall_ahead_does_not_count_before_it_is_below_the_character
     assert abs(lifted[-1] - height) < 0.02
 
 
+@pytest.mark.parametrize("height", [0.45, 2.4])
+def test_nothing_lifts_a_character_that_goes_below_a_bench_or_a_roof(height):
+    fields = [
+        terrain.heightfield(jnp.full((2, 2), level), (20.0, length), (-10.0, 0.0, start),
+                            interpolation="triangulated")
+        for level, start, length in ((0.0, -39.0, 80.0), (height, 1.0, 0.5), (height, 2.0, 0.5))
+    ]  # fmt: skip
+    lifted = heights(terrain.combine(*fields), glide(), GroundRoot())
+    np.testing.assert_allclose(lifted, 0.0, atol=1e-6)
+
+
 def test_the_root_moves_no_faster_than_its_limit():
     lifted = heights(step(-2.0), glide(), GroundRoot(max_speed=1.0))
     speed = np.abs(np.diff(lifted)) * HZ
