@@ -66,6 +66,15 @@ def accepted_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Any) -> Any:
     return hit.found, hit.point, hit.normal
 
 
+@jax.jit
+def carrying_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Any) -> Any:
+    """The same, over gaps."""
+    assert isinstance(ik.probe, AbstractLimitedProbe)
+    layers = jnp.asarray(ALL_LAYERS, jnp.uint32)
+    hit = ik.probe.cast_over_gaps(inputs_of(ground), starts_ws, jnp.asarray(2.4), layers)
+    return hit.found, hit.point, hit.normal, hit.distance
+
+
 def read(ik: jaxik.FootIK, ground: PlainTerrain, starts: Any) -> list[np.ndarray]:
     return [np.asarray(x) for x in accepted_ground(ik, to_terrain(ground), jnp.asarray(starts))]
 
@@ -167,6 +176,34 @@ def test_ground_narrower_than_the_sole_is_refused():
         found = found_on(system("FootProbe", check_support=True), ground, 0.0)[0]
         assert found == (name in ("plank", "floor")), name
         assert found_on(system("FootProbe"), ground, 0.0)[0] == 1, name
+
+
+def test_feet_stand_over_gaps_narrower_than_half_a_sole_and_step_into_wider_ones():
+    ik, heights = system("FootProbe"), {}
+    starts = np.zeros((60, 2, 3)) + [0.0, UP_START, 0.0]
+    starts[:, 0, 2] = np.linspace(-0.15, 0.15, 60)
+    starts[:, 1, 0] = np.linspace(-0.15, 0.15, 60)  # along the other axis
+    for width in (0.0, 0.03, 0.2):
+        plates = [(-2.0, -width / 2), (width / 2, 2.0)]
+        across = level_blocks(*((*ends, 0.0) for ends in plates), (-3.0, 3.0, -0.2))
+        along = level_blocks(*((-2.0, 2.0, 0.0, *ends) for ends in plates), (-3.0, 3.0, -0.2))
+        for leg, ground in enumerate((across, along)):
+            found, point, normal, distance = carrying_ground(ik, to_terrain(ground), starts)
+            np.testing.assert_array_equal(found, 1.0)
+            np.testing.assert_allclose(normal[..., 1], 1.0, atol=1e-12)
+            np.testing.assert_allclose(distance, UP_START - point[..., 1], atol=1e-12)
+            heights[width] = np.asarray(point)[:, leg, 1]
+            place = starts[:, leg, [2, 0][leg]]
+            gap = (np.abs(place) < width / 2) & (width > 0.1)
+            np.testing.assert_allclose(heights[width], np.where(gap, -0.2, 0.0), atol=1e-12)
+    unlimited = parameter_tree.with_option(ik, "probe.limited", False)
+    slope = PlainTerrain(maths.Y, triangles=np.array(sloped(0.5) * BLOCKS))
+    for system_on, ground in ((ik, slope), (unlimited, bumps())):
+        places = system_on, to_terrain(ground), jnp.asarray(starts_over_bumps(seed=4))
+        for plain, carrying in zip(
+            accepted_ground(*places), carrying_ground(*places), strict=False
+        ):
+            np.testing.assert_allclose(carrying, plain, rtol=0, atol=1e-12)
 
 
 def test_a_foot_may_stand_on_an_edge_and_beside_a_wall():

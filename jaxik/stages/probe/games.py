@@ -55,7 +55,7 @@ class FootProbe(AbstractLimitedProbe):
         ankle_ws = animated_ankles(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(inputs.rig, frame, self.toe_ls))
         starts = (ankle_ws + above, toe_ws + above)
-        ankle, toe = separate(self.cast(inputs, jnp.stack(starts), reach, self.layers))
+        ankle, toe = separate(self.cast_over_gaps(inputs, jnp.stack(starts), reach, self.layers))
         toe = with_weight(toe, jnp.where(self.use_toe, toe.found, 0.0))
         if self.limited:
             toe = on_same_ground(toe, ankle, terrain.leg_up_ws)
@@ -87,7 +87,7 @@ class RootProbe(AbstractLimitedProbe):
         up, ankle_ws = terrain.leg_up_ws, animated_ankles(frame).pos
         over_level = vec.dot(ankle_ws - level_origin(inputs), up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_level)
-        hit = self.cast(inputs, start, self.ray_up + self.ray_down, self.layers)
+        hit = self.cast_over_gaps(inputs, start, self.ray_up + self.ray_down, self.layers)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.zeros_like(hit.found), rays)
 

@@ -21,6 +21,9 @@ RING = tuple(  # forward and right of the rays that look for support around a fo
 SUPPORT_FADE = 0.25  # of the ring, over which ground becomes too narrow
 SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
 SAME_GROUND = 1e-3  # m, between hits of one surface at most
+HOLLOW = (
+    0.02  # m, depth up to which ground between two others is uneven, and over which it is a gap
+)
 
 
 class AbstractLimitedProbe(AbstractProbe):
@@ -35,6 +38,9 @@ class AbstractLimitedProbe(AbstractProbe):
     that goes on as it is there, neither higher nor lower by more than that radius. A post has none
     around it, a beam two, an edge half, a floor all eight. Ground with less than `min_support` of
     them is refused.
+
+    Feet stand over gaps narrower than `support_radius`, in the ground and between planks
+    (`cast_over_gaps`): what lies that far to either side carries them.
 
     Ground fades out over `step_fade`, `SLOPE_FADE` and `SUPPORT_FADE` beyond its limit: `found`
     falls from 1 to 0.
@@ -113,6 +119,35 @@ class AbstractLimitedProbe(AbstractProbe):
             vec.normalize(lerp(first.normal, below.normal, lower[..., None]), up),
             lerp(first.distance, below.distance + above, lower),
             found,
+            platform,
+        )
+
+    def cast_over_gaps(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
+        """What carries feet below these points: `cast`, or the lower side of a narrow gap.
+
+        The sides are diagonally to the foot, so that it stands over gaps along it and across.
+        """
+        if not self.limited:
+            return self.cast(inputs, starts_ws, reach, layers)
+        up = inputs.terrain.leg_up_ws
+        forward, aside = foot_heading(inputs, up)
+        away = vec.scale(forward + aside, self.support_radius)
+        starts = jnp.stack([starts_ws, starts_ws + away, starts_ws - away])
+        hits = self.cast(inputs, starts, reach, layers)
+        hit, left, right = (jax.tree.map(lambda x: x[i], hits) for i in range(3))  # noqa: B023
+        heights = vec.dot(hits.point, up)
+        side = jnp.where(heights[1] < heights[2], heights[1], heights[2])
+        depth = side - heights[0]
+        spans = left.found * right.found * smoothstep((depth - HOLLOW) / HOLLOW)
+        normal = lerp(hit.normal, left.normal + right.normal, spans[..., None])
+        platform = hit.platform
+        if platform is not None:
+            platform = jnp.where(spans > 0.5, left.platform, platform)
+        return Hit(
+            hit.point + vec.scale(up, spans * depth),
+            vec.normalize(normal, up),
+            hit.distance - spans * depth,
+            lerp(hit.found, jnp.ones_like(spans), spans),
             platform,
         )
 
