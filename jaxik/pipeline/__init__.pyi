@@ -1,13 +1,12 @@
-from . import centring as centring
 from . import character as character
 from . import faults as faults
+from . import frames as frames
 from . import packing as packing
 from . import phases as phases
 from . import preconditions as preconditions
 from . import shapes as shapes
 from . import simulation as simulation
 from . import system as system
-from . import tracks as tracks
 from .character import Character as Character
 from .preconditions import check as check
 from .simulation import resume as resume

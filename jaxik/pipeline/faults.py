@@ -4,6 +4,7 @@ Neither changes what a system remembers. All is computed anyway and what counts 
 end, so that a member of a batch neither spoils its neighbours nor keeps them waiting.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TypeVar
@@ -71,7 +72,8 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
     weight, foot_speed, toe_speed, stride = of_legs
     world_from_model, grounded, slide, velocity_ws, stride_scale, dt = whole
     platforms, platforms_before = _chosen(frame_sound[..., None], platforms)
-    cleaned = Frame(
+    cleaned = dataclasses.replace(
+        frame,
         world_from_model=world_from_model,
         pose=LegPose(*joints),
         weight=weight,
@@ -85,8 +87,6 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
         platforms=platforms,
         platforms_before=platforms_before,
         stride_scale=stride_scale,
-        restart=frame.restart,
-        rig=frame.rig,
     )
     return cleaned, Faults(faulty, ~frame_sound)
 

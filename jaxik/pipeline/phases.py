@@ -7,6 +7,7 @@ is what the probe remembers. How frames are fed in is no part of the algorithm: 
 
 import dataclasses
 import functools
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +18,16 @@ from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.leg import LegGoal
 from jaxik.stages.pelvis import PelvisMoment
 from jaxik.stages.probe import foot_heading
+from jaxik.world import places
 from jaxik.world.frame import Contact, Sensed, Stride, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
-from .centring import in_world
 from .faults import Faults
 from .frames import AbstractFrames
 from .system import Advanced, Corrections, FootIK, Result, State, Trace
+
+Tree = TypeVar("Tree")
 
 
 def solve(frames: AbstractFrames) -> tuple[State, Result]:
@@ -206,9 +209,17 @@ def pose(
         None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
     corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch)
-    advanced_ws = dataclasses.replace(in_world(inputs, advanced), state=advanced.state)
-    trace = Trace(in_world(inputs, sensed), advanced_ws)
+    advanced_ws = dataclasses.replace(_in_world(inputs, advanced), state=advanced.state)
+    trace = Trace(_in_world(inputs, sensed), advanced_ws)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)
+
+
+def _in_world(inputs: Inputs, tree: Tree) -> Tree:
+    """What was computed about the centre of a frame, in world space as the caller knows it."""
+    if inputs.centre_ws is None:
+        return tree
+    terrain = inputs.terrain
+    return places.moved(tree, inputs.centre_ws, terrain.up_ws, terrain.leg_up_ws)
 
 
 def _shared_platform(hit: Hit, present: Array) -> Hit:

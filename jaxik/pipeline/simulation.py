@@ -15,11 +15,10 @@ from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import LegTerrains, Terrain
 
 from .faults import Faults, clean
-from .frames import Clip, OneFrame
+from .frames import Clip, OneFrame, Tracks, read_tracks
 from .phases import solve
 from .shapes import check_inputs, check_state, with_floats_of
 from .system import FootIK, Result, State, init
-from .tracks import Tracks, read_tracks
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -105,15 +104,14 @@ def resume(
 
 def _start(
     ik: FootIK, inputs: Inputs, state: State, checked: bool
-) -> tuple[FootIK, Inputs, State, Faults | None, State]:
-    """All in the rig's floats and with sound frames, where these were not, and a fresh memory."""
-    fresh = init(ik, inputs.rig)
-    check_state(state, fresh)
+) -> tuple[FootIK, Inputs, State, Faults | None]:
+    """All in the rig's floats, and with sound frames where these were not."""
+    check_state(state, init(ik, inputs.rig))
     ik, inputs, state = with_floats_of(inputs.rig, (ik, inputs, state))
     if checked:
-        return ik, inputs, state, None, fresh
+        return ik, inputs, state, None
     frame, faults = clean(inputs.frame, inputs.rig.present)
-    return ik, dataclasses.replace(inputs, frame=frame), state, faults, fresh
+    return ik, dataclasses.replace(inputs, frame=frame), state, faults
 
 
 @_jit(static_argnames=("block", "checked"))

@@ -1,5 +1,6 @@
 """What a foot-IK system is, what it remembers, and what it returns."""
 
+import dataclasses
 from typing import TypeVar
 
 import equinox as eqx
@@ -158,20 +159,9 @@ def init(ik: FootIK, rig: Rig) -> State:
 
 def fresh_memory(ik: FootIK, rig: Rig) -> State:
     """What `init` returns, without its checks."""
-    return State(
-        jnp.zeros((), bool),
-        jnp.zeros(3, rig.side.dtype),
-        ik.contact.init(rig),
-        ik.root.init(rig),
-        ik.probe.init(rig),
-        ik.target.init(rig),
-        ik.lean.init(rig),
-        ik.lock.init(rig),
-        ik.separation.init(rig),
-        ik.pelvis.init(rig),
-        ik.effector.init(rig),
-        ik.fade.init(rig),
-    )
+    started, centre_ws = jnp.zeros((), bool), jnp.zeros(3, rig.side.dtype)
+    stages = [field.name for field in dataclasses.fields(State)][2:]
+    return State(started, centre_ws, *(getattr(ik, stage).init(rig) for stage in stages))
 
 
 def restarted(memory: Tree, fresh: Tree, restart: Bool[Array, ""] | None) -> Tree:

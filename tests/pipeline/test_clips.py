@@ -20,7 +20,7 @@ from fitting.clips.clip_frames import frames_from_clip
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import character, packing
-from jaxik.pipeline.tracks import Tracks
+from jaxik.pipeline.frames import Tracks
 from jaxik.stages.root import GroundRoot
 from jaxik.world import terrain
 from support import cases, clips, singular

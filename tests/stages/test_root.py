@@ -41,7 +41,7 @@ def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> j
     rig, ik = walk().rig, dataclasses.replace(jaxik.presets.record(), root=rule)
     inputs = Inputs(rig, ground, clip, jaxik.HARD)
     state = jaxik.init(ik, rig)
-    clip_frames = Clip(ik, inputs, state, None, state, {})
+    clip_frames = Clip(ik, inputs, state, None, {})
     return clip_frames.ahead("root", lambda ik, inputs: ik.root.sense(inputs)).output
 
 

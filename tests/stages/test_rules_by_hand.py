@@ -64,7 +64,7 @@ def sense(
     if memory is not None:
         state = dataclasses.replace(state, started=jnp.ones((), bool), contact=memory)
     inputs = Inputs(rig, LEVEL, frames, jaxik.HARD)
-    clip = Clip(ik, inputs, state, None, state, {})
+    clip = Clip(ik, inputs, state, None, {})
     return clip.ahead("contact", lambda ik, inputs: ik.contact.sense(inputs))
 
 
