@@ -21,30 +21,20 @@ SPEED_BAND = 0.05  # m/s, width of softened speed decisions
 class AbstractContact(Rule):
     """Decides from the animation which feet stand."""
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def sense(self, inputs: Inputs) -> Contact:
         """Lift and contact of each foot from this frame alone."""
 
-    @abstractmethod
     def advance(self, now: Moment, contact: Contact, state: PyTree) -> tuple[PyTree, Contact]:
         """Memory after this frame, and the contact that it and `contact` give."""
-
-
-class AbstractInstantContact(AbstractContact):
-    """Contact without memory: `sense` decides."""
-
-    def init(self, rig: Rig) -> None:
-        return None
-
-    def advance(self, now: Moment, contact: Contact, state: None) -> tuple[None, Contact]:
         return None, contact
 
 
-class HeightContact(AbstractInstantContact):
+class HeightContact(AbstractContact):
     """Contact by ankle height: 1 up to `planted_height`, 0 from `raised_height`, linear between.
 
     A limb that bears nothing, such as a hand on a wall, stands at any height.
@@ -87,7 +77,7 @@ class HeightContact(AbstractInstantContact):
         )
 
 
-class StandingContact(AbstractInstantContact):
+class StandingContact(AbstractContact):
     """All feet stand, so that foot IK works wherever there is ground (ozz, Mec).
 
     With a finite `idle_speed` they stand while the character stands still only (Unreal).
@@ -104,7 +94,7 @@ class StandingContact(AbstractInstantContact):
         return Contact(lift, idle, idle, 1.0 - idle)
 
 
-class LabelContact(AbstractInstantContact):
+class LabelContact(AbstractContact):
     """Contact from the labels that come with the animation (`Stride.standing`)."""
 
     ground_height: Leaf = length(0, -0.5, 0.5, "Height of the animation's floor in model space.")

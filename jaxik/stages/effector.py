@@ -55,13 +55,13 @@ class AbstractEffector(Rule):
     by_contact: eqx.AbstractVar[Array]
     """Whether each leg's weight has its contact as a factor."""
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
-    @abstractmethod
     def awake(self, now: SensedMoment, state: PyTree) -> Float[Array, ""]:
         """0 while the body is to stay where it is, else 1."""
+        return jnp.ones_like(now.dt)
 
     @abstractmethod
     def advance(
@@ -77,17 +77,7 @@ class AbstractEffector(Rule):
         """
 
 
-class AbstractInstantEffector(AbstractEffector):
-    """Effectors without memory."""
-
-    def init(self, rig: Rig) -> None:
-        return None
-
-    def awake(self, now: SensedMoment, state: None) -> Float[Array, ""]:
-        return jnp.ones_like(now.dt)
-
-
-class DirectEffector(AbstractInstantEffector):
+class DirectEffector(AbstractEffector):
     """The targets themselves; a foot without ground goes to its animated place.
 
     With `if_found` on, the leg of a foot without ground moves with the body instead (ozz).
@@ -103,7 +93,7 @@ class DirectEffector(AbstractInstantEffector):
         return None, Effector(target.pos, target.rot, weight)
 
 
-class HeelEffector(AbstractInstantEffector):
+class HeelEffector(AbstractEffector):
     """Lifts the heel of a leg that would be over-stretched, as the trailing foot of a walker.
 
     The foot, tilted as the ground, turns about its ball, toes down, until the distance from hip to
@@ -283,9 +273,6 @@ class FadeEffector(AbstractEffector):
     def init(self, rig: Rig) -> FadeState:
         identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
         return FadeState(jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls), identity)
-
-    def awake(self, now: SensedMoment, state: FadeState) -> Float[Array, ""]:
-        return jnp.ones_like(now.dt)
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: FadeState

@@ -32,9 +32,9 @@ class AbstractFade(Rule):
 
     per_leg: ClassVar[bool] = False
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def lasting(self, weight: Float[Array, " legs"], state: PyTree) -> Float[Array, " legs"]:
@@ -75,9 +75,6 @@ class AbstractFade(Rule):
 
 class NoFade(AbstractFade):
     """Weights act at once; where they jump, so does the pose."""
-
-    def init(self, rig: Rig) -> None:
-        return None
 
     def lasting(self, weight: Array, state: None) -> Array:
         return weight

@@ -27,34 +27,22 @@ class AbstractRoot(Rule):
 
     per_leg: ClassVar[bool] = False
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def sense(self, inputs: Inputs) -> PyTree:
         """What `advance` needs from this frame alone."""
 
-    @abstractmethod
     def advance(
         self, now: Moment, sensed: PyTree, state: PyTree
     ) -> tuple[PyTree, Float[Array, ""]]:
         """Memory after this frame, and how far the character moves along up in it, m."""
-
-
-class AbstractInstantRoot(AbstractRoot):
-    """Moves the character without memory: `sense` returns how far along up, m."""
-
-    def init(self, rig: Rig) -> None:
-        return None
-
-    def advance(
-        self, now: Moment, sensed: Float[Array, ""], state: None
-    ) -> tuple[None, Float[Array, ""]]:
         return None, sensed
 
 
-class KeepRoot(AbstractInstantRoot):
+class KeepRoot(AbstractRoot):
     """The character stays where the game put it."""
 
     def sense(self, inputs: Inputs) -> Float[Array, ""]:

@@ -20,9 +20,9 @@ STEEPEST = 0.5  # cosine of the steepest slope along which a foot moves
 class AbstractSeparation(Rule):
     """Keeps feet from crossing and from standing on each other."""
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def advance(
@@ -40,9 +40,6 @@ class AbstractSeparation(Rule):
 
 class NoSeparation(AbstractSeparation):
     """Feet go where animation, ground and locks put them."""
-
-    def init(self, rig: Rig) -> None:
-        return None
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hold: Hold, state: None

@@ -25,26 +25,16 @@ class AbstractTarget(Rule):
     foot_height: eqx.AbstractVar[Array]
     """m, sole to ankle."""
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         """The foothold from this frame alone."""
 
-    @abstractmethod
     def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Float[Array, " legs"]]:
         """Memory after this frame, and how far it and limits move each foothold along up, m."""
-
-
-class AbstractInstantTarget(AbstractTarget):
-    """Places footholds without memory: `sense` decides."""
-
-    def init(self, rig: Rig) -> None:
-        return None
-
-    def advance(self, now: SensedMoment, state: None) -> tuple[None, Float[Array, " legs"]]:
         return None, jnp.zeros_like(now.sensed.foothold.height)
 
 
@@ -166,7 +156,7 @@ class SlopeTarget(AbstractTarget):
         return jnp.where(now.started, climb, 0.0)
 
 
-class SoleTarget(AbstractInstantTarget):
+class SoleTarget(AbstractTarget):
     """Puts the sole on the ground whatever the animated lift: `ankle = I + u h / (n·u)` (ozz).
 
     I is the hit, u up, n the ground's normal and h `foot_height`. With a `max_slope` of 0 the ankle
@@ -189,7 +179,7 @@ class SoleTarget(AbstractInstantTarget):
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
-class RootTarget(AbstractInstantTarget):
+class RootTarget(AbstractTarget):
     """Moves a standing foot by the ground's height above the root, plus `adjust` (Unreal).
 
     The animated height above the root is kept: the animation was made for ground at root height. A

@@ -33,9 +33,9 @@ class AbstractLean(Rule):
 
     per_leg: ClassVar[bool] = False
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
@@ -48,9 +48,6 @@ class AbstractLean(Rule):
 
 class NoLean(AbstractLean):
     """The body does not lean."""
-
-    def init(self, rig: Rig) -> None:
-        return None
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         frame = inputs.frame

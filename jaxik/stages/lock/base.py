@@ -28,9 +28,9 @@ class Hold:
 class AbstractLock(Rule):
     """Keeps standing feet in place."""
 
-    @abstractmethod
     def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
+        """Memory before the first frame; None for a rule that goes by each frame alone."""
+        return None
 
     @abstractmethod
     def advance(
@@ -48,9 +48,6 @@ class AbstractLock(Rule):
 
 class NoLock(AbstractLock):
     """No locks: feet follow their footholds."""
-
-    def init(self, rig: Rig) -> None:
-        return None
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: None
