@@ -114,6 +114,7 @@ def _off(ik: jaxik.FootIK) -> tuple[str, ...]:
     names = ("warp.",)  # of `Frame.stride_scale`
     names += () if options.get("probe.limited") else LIMITS
     names += () if options.get("probe.check_support") else SUPPORT
+    names += () if options.get("leg.allow_stretch") else ("leg.max_stretch",)
     if not _is_on(ik, "root.enabled"):
         return names + ROOT
     return names + (() if _is_on(ik, "root.half_life") else SPEED_OF_ROOT)

@@ -73,7 +73,10 @@ class AbstractTwoBoneLeg(AbstractLeg):
     """
 
     max_stretch: Leaf = ratio(
-        1.05, 1, 1.3, "Length of a stretched leg's bones, at most, as a multiple of the animated one."
+        1.05,
+        1,
+        1.3,
+        "Longest bones of a stretched leg, as a multiple of the animated ones.",
     )
     allow_stretch: bool = option(
         False, "Whether bones of legs are stretched to targets out of reach."

@@ -58,6 +58,7 @@ CASES: dict[str, dict[str, dict[str, Any]]] = {
     "mec": {
         "as it is": {},
         "never planted": {"lock.plant": False, "probe.by_speed": False},
+        "stretched": {"pelvis.enabled": False, "leg.max_stretch": 1.03, "leg.soften": 0.9},
         "odd": named("probe", ray_up=0.3, foot_length=0.16, half_width=0.06, stable_height=0.13)
         | named("probe", extra_min=0.01, extra_max=0.06)
         | {"target.foot_height": 0.085, "lock.plant_weight": 0.6, "foot.max_tilt": 0.1}
@@ -120,6 +121,7 @@ def outputs_of(preset: str, result: jaxik.Result, expected: dict[str, Any]) -> d
         case _:
             own = {
                 "extra": sensed.ground.rays.below,
+                "stretch": result.corrections.stretch,
                 "planted": advanced.hold.locked,
                 "plant_weight": after.lock.weight,
                 "fade": after.effector.weight,
@@ -240,6 +242,8 @@ def test_a_clip_agrees_with_the_reference(name, how):
     expected = compare(name, values, scene(not name.startswith("record"), moves=how == "odd"))
     if name.startswith("record") and values.get("lock.enabled", True):
         assert 0.1 < expected["locked"].mean() < 0.9
+    if values.get("leg.max_stretch"):
+        assert 0.01 < (expected["stretch"] > 1.001).mean() < 0.5
     if name == "unreal" and not values:
         switches = np.abs(np.diff(expected["asleep"].astype(int)))
         assert switches.sum() >= 6, "the latch sleeps and wakes"

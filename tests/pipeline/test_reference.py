@@ -231,6 +231,8 @@ def test_joints_carry_their_bones_and_reached_ankles_are_on_their_targets(system
         for upper, lower in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe")):
             joint = Transform(*(part[leg] for part in getattr(frame, upper)))
             local = maths.unapply(joint, getattr(frame, lower).pos[leg])
+            if upper != "ankle" and "stretch" in output:
+                local = local * output["stretch"][index, leg]
             now = Transform(output[f"{upper}_pos"][index, leg], output[f"{upper}_rot"][index, leg])
             carried = maths.apply(now, local)
             assert np.allclose(carried, output[f"{lower}_pos"][index, leg], atol=EXACT)

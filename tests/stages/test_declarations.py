@@ -32,6 +32,7 @@ HeelEffector: extension 1 0.98 0.8 1; max_lift rad 0.6 0 1.2
 SpeedFade: speed m/s 0.5 0.1 3
 AimFoot: offset m 0,0,0 -0.2 0.2
 AimFoot PoleLeg TwoBone: twist rad 0 -1 1; weight 1 1 0 1
+PoleLeg TwoBone: max_stretch 1 1.05 1 1.3
 FlatFoot: max_tilt rad 0.7853982 0 1.5
 PitchRollFoot: max_pitch rad 0.52 0 1.4; min_pitch rad -0.79 -1.4 0; max_roll rad 0.26 0 1;
   min_roll rad -0.52 -1 0
@@ -120,10 +121,10 @@ mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; Grou
   CornerProbe by_speed=yes extra_min=-0.03 stable_height=0.095 stable_speed=0.25;
   SoleTarget max_slope=0 foot_height=0.085; NoLean;
   PlantLock release_distance=0.15 release_angle=0.5; FootSeparation;
-  LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg; FlatFoot; SpeedFade
+  LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg allow_stretch=yes; FlatFoot; SpeedFade
 mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no;
   SoleTarget max_slope=0 foot_height=0.1; NoLean; PlantLock; NoSeparation; LegLengthPelvis;
-  FadeEffector; PoleLeg to_hint=yes; FlatFoot; NoFade
+  FadeEffector; PoleLeg to_hint=yes allow_stretch=yes; FlatFoot; NoFade
 stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
@@ -142,13 +143,13 @@ FadeEffector.by_contact=no FootProbe.check_support=no FootProbe.limited=yes Foot
 GroundRoot.enabled=yes HeelEffector.by_contact=no
 LegLengthPelvis.damp=yes LegLengthPelvis.enabled=yes LowestPelvis.enabled=yes
 LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=yes
-OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes PoleLeg.to_hint=no
-ReachPelvis.spring=no
+OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.allow_stretch=no PoleLeg.enabled=yes
+PoleLeg.to_hint=no ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
 StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no
 StrideProbe.use_strides=yes
-SupportPelvis.spring=no TwoBone.as_animated=no
+SupportPelvis.spring=no TwoBone.allow_stretch=no TwoBone.as_animated=no
 """
 
 

@@ -23,6 +23,8 @@ class Solved(NamedTuple):
     knee: Transform
     ankle: Transform
     reached: bool
+    stretch: float = 1.0
+    """Of thigh and shin."""
 
 
 def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
@@ -55,29 +57,44 @@ def solve_leg(leg: Leg, body: Transform, target: Array) -> Solved:
     hip, knee, ankle = carry(body, leg)
     axis = hinge_of(leg, knee)
     distance = length(target - hip.pos)
-    nearest, soft_from, wanted = _wanted_distance(leg, hip.pos, knee.pos, ankle.pos, distance)
+    nearest, soft_from, _ = _wanted_distance(leg, hip.pos, knee.pos, ankle.pos, distance)
+    stretch, farthest = stretched(leg, distance, soft_from)
+    longer = [hip.pos + stretch * (joint.pos - hip.pos) for joint in (knee, ankle)]
+    wanted = _wanted_distance(leg, hip.pos, *longer, distance)[2]
     knee_rot = maths.from_axis_angle(
-        axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted)
+        axis, _knee_angle(hip.pos - longer[0], longer[1] - longer[0], axis, wanted)
     )
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
     hip_rot = _hip_rotation(bent - hip.pos, target - hip.pos, axis, leg["leg.twist"])
-    reached = nearest <= distance <= soft_from and leg.weight >= 1.0
-    return _rotated(Solved(hip, knee, ankle, reached), hip_rot, knee_rot, leg.weight)
+    reached = nearest <= distance <= farthest and leg.weight >= 1.0
+    return _rotated(Solved(hip, knee, ankle, reached, stretch), hip_rot, knee_rot, leg.weight)
+
+
+def stretched(leg: Leg, distance: float, soft_from: float) -> tuple[float, float]:
+    """By how much thigh and shin are longer than animated, and how far they reach at most, m."""
+    if not leg.parameters.values.get("leg.allow_stretch"):
+        return 1.0, soft_from
+    most = leg["leg.max_stretch"]
+    return clip(distance / soft_from, 1.0, most), most * soft_from
 
 
 def _rotated(leg: Solved, hip_rot: Array, knee_rot: Array, weight: float) -> Solved:
-    """A leg after both rotations by a weight, the knee's first."""
-    hip, knee, ankle, reached = leg
+    """A leg after both rotations by a weight, the knee's first, and as far stretched."""
+    hip, knee, ankle, reached, stretch = leg
+    stretch = 1.0 + weight * (stretch - 1.0)
     knee_rot = maths.nlerp(maths.IDENTITY, knee_rot, weight)
     hip_rot = maths.nlerp(maths.IDENTITY, hip_rot, weight)
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
     shin_rot = multiply(hip_rot, knee_rot)
-    moved_knee, moved_ankle = (hip.pos + rotate(hip_rot, x - hip.pos) for x in (knee.pos, bent))
+    moved_knee, moved_ankle = (
+        hip.pos + stretch * rotate(hip_rot, x - hip.pos) for x in (knee.pos, bent)
+    )
     return Solved(
         Transform(hip.pos, multiply(hip_rot, hip.rot)),
         Transform(moved_knee, multiply(shin_rot, knee.rot)),
         Transform(moved_ankle, multiply(shin_rot, ankle.rot)),
         reached,
+        stretch,
     )
 
 
@@ -142,16 +159,20 @@ def solve_leg_to_pole(
         weight: of both rotations, 0..1.
     """
     hip, knee, ankle = carry(body, leg)
+    bones = length(knee.pos - hip.pos) + length(ankle.pos - knee.pos)
+    distance, soften = length(target - hip.pos), leg["leg.soften"]
+    stretch, farthest = stretched(leg, distance, soften * bones)
     hip_rot, knee_rot, in_reach = joint_rotations(
-        knee.pos - hip.pos,
-        ankle.pos - hip.pos,
+        stretch * (knee.pos - hip.pos),
+        stretch * (ankle.pos - hip.pos),
         hinge_of(leg, knee),
         target - hip.pos,
         pole,
-        leg["leg.soften"],
+        soften,
         leg["leg.twist"],
     )
-    carried = Solved(hip, knee, ankle, in_reach and weight >= 1.0)
+    in_reach |= soften * bones < distance <= farthest
+    carried = Solved(hip, knee, ankle, in_reach and weight >= 1.0, stretch)
     return _rotated(carried, hip_rot, knee_rot, weight)
 
 
@@ -293,7 +314,7 @@ def with_foot(
     leg: Leg, solved: Solved, rot: Array
 ) -> tuple[Transform, Transform, Transform, Transform, bool]:
     """Hip, knee, ankle with this rotation, the toe carried rigidly with it, and `reached`."""
-    hip, knee, (ankle, _), reached = solved
+    hip, knee, (ankle, _), reached, _ = solved
     change = multiply(rot, maths.inverse(leg.joint("ankle").rot))
     reach = leg.joint("toe").pos - leg.joint("ankle").pos
     toe = Transform(ankle + rotate(change, reach), multiply(change, leg.joint("toe").rot))

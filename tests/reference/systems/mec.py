@@ -21,7 +21,8 @@ AS_IT_COMES = (
     | named("lock", plant=True, plant_weight=1.0, plant_speed=math.inf)
     | named("lock", release_distance=math.inf, release_angle=math.pi, release_time=0.3)
     | named("pelvis", enabled=True, min_length=0.5, max_length=0.88, damp=True, speed=10.0)
-    | {"leg.soften": 1.0, "leg.twist": 0.0, "leg.weight": 1.0, "foot.max_tilt": math.radians(45.0)}
+    | named("leg", soften=1.0, twist=0.0, weight=1.0, allow_stretch=True, max_stretch=1.05)
+    | {"foot.max_tilt": math.radians(45.0)}
 )
 DEFAULTS = AS_IT_COMES | {"leg.hint_offset": np.zeros(3)}
 """Of the faithful system."""
@@ -96,7 +97,7 @@ def step(
     offset_ws = up * pelvis * frame.grounded
     body = limb.body(frame, offset_ws, maths.IDENTITY)
 
-    solved, weights, hints = [], [], []
+    solved, weights, hints, stretches = [], [], [], []
     for foot, after, target, rot in zip(feet, memory, targets, goal_rots, strict=True):
         weight = foot.weight * after.fade
         hint_ws = np.zeros(3)
@@ -113,6 +114,7 @@ def step(
         wanted = multiply(model_from_foot, maths.inverse(rig.ankle_from_foot[foot.index]))
         solved.append(limb.with_foot(foot, leg, maths.nlerp(leg.ankle.rot, wanted, weight)))
         weights.append(weight)
+        stretches.append(leg.stretch)
         hints.append(hint_ws)
 
     output = characters.solution(body, solved) | {
@@ -123,6 +125,7 @@ def step(
         "goal_rot": np.array(goal_rots),
         "weight": np.array(weights),
         "hint_ws": np.array(hints),
+        "stretch": np.array(stretches),
     }
     for name in ("found", "extra", "pitch", "roll"):
         output[name] = np.array([getattr(foot, name) for foot in feet])
