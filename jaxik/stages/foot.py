@@ -1,4 +1,4 @@
-"""Stage 12: ankle rotations that align the feet with the ground."""
+"""Stage 11: ankle rotations that align the feet with the ground."""
 
 from abc import abstractmethod
 

@@ -1,4 +1,4 @@
-"""Stage 3: strides scaled for a character that is faster or slower than its animation."""
+"""Strides scaled for a character that is faster or slower than its animation, before the probe."""
 
 from jaxtyping import Array, Float
 
