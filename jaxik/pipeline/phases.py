@@ -94,7 +94,6 @@ def sense(
     return Sensed(
         up_ws=terrain.up_ws,
         leg_up_ws=up,
-        dt=frame.dt,
         slide=frame.slide,
         carry=frame.carry(_shared_platform(ground.ankle, rig.present)),
         present=rig.present,

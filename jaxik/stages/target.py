@@ -35,7 +35,7 @@ class AbstractTarget(Rule):
 
     def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Float[Array, " legs"]]:
         """Memory after this frame, and how far it and limits move each foothold along up, m."""
-        return None, jnp.zeros_like(now.sensed.foothold.height)
+        return None, jnp.zeros_like(now.sensed.foothold.lift)
 
 
 @struct
@@ -119,7 +119,8 @@ class SlopeTarget(AbstractTarget):
         climb = jnp.where(self.follow_slopes, self._climb(now, state), 0.0)
         before = state.height + now.sensed.ground_rise + climb
         swing_lift = now.sensed.ground.lift
-        goal = foothold.height if swing_lift is None else foothold.height + swing_lift
+        ground = vec.dot(foothold.point_ws, now.sensed.leg_up_ws)
+        goal = ground if swing_lift is None else ground + swing_lift
         gap = goal - before
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         fraction = gate.choose(
@@ -138,7 +139,7 @@ class SlopeTarget(AbstractTarget):
         lift = foothold.lift if swing_lift is None else foothold.lift - swing_lift
         over_sole = lift - self.foot_height
         over_sole = jnp.where(over_sole > 0, over_sole, 0.0)
-        deepest = foothold.height - over_sole - self.max_penetration
+        deepest = ground - over_sole - self.max_penetration
         height = gate.clip(height, deepest, jnp.full_like(height, jnp.inf), band=HEIGHT_BAND)
         rise = height - goal
         ankle = foothold.ankle_height_ms + rise * foothold.climb

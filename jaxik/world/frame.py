@@ -181,8 +181,6 @@ class Foothold:
     """Metres."""
     lift: Float[Array, " legs"]
     """Metres."""
-    height: Float[Array, " legs"] = place("leg height")
-    """m, of the point along up."""
     ankle_height_ms: Float[Array, " legs"]
     """m, of the ankle above it, model space."""
     climb: Float[Array, "*legs"]
@@ -213,7 +211,6 @@ class Sensed:
     """Up of the body."""
     leg_up_ws: Float[Array, "*legs 3"]
     """Up of each leg, or one for all."""
-    dt: Float[Array, ""]
     slide: Float[Array, ""]
     carry: Transform | Still = place("motion")
     """World motion, since the previous frame, of the ground under each foot."""
@@ -323,7 +320,7 @@ def foothold(frame: Frame, up_ws: Array, point_ws: Array, lift: Array, found: Ar
     model_up = quat.rotate(frame.world_from_model.rot, vec.constant(UP, up_ws))
     climb = vec.dot(model_up, up_ws)
     base = vec.dot(point_ws - frame.world_from_model.pos, model_up)
-    return Foothold(point_ws, lift, vec.dot(point_ws, up_ws), base + lift * climb, climb, found)
+    return Foothold(point_ws, lift, base + lift * climb, climb, found)
 
 
 def heading(world_from_model: Transform, up_ws: Float[Array, "*legs 3"]) -> tuple[Array, Array]:

@@ -109,7 +109,7 @@ def positions(result: Result) -> list[jax.Array]:
     assert result.trace is not None
     sensed, advanced = result.trace.sensed, result.trace.advanced
     places = [sensed.ankle_ws, sensed.ground.ankle.point, advanced.effector.target_ws]
-    poses = [result.pose.ankle.pos, result.pose.knee.rot, result.body.pos, sensed.foothold.height]
+    poses = [result.pose.ankle.pos, result.pose.knee.rot, result.body.pos]
     return [*places, *poses, *jax.tree.leaves(advanced.state)]
 
 

@@ -142,7 +142,7 @@ def faded(trace: Trace, ground: Terrain) -> tuple[Transform, jax.Array]:
     def scanned(carry, frame):
         state, started = carry
         sensed, wanted, effector = frame
-        now = SensedMoment(sensed.dt, started, HARD, sensed, ground)
+        now = SensedMoment(jnp.asarray(1.0 / HZ), started, HARD, sensed, ground)
         state, body = fade.body(now, wanted, sensed.weight, state)
         state, weight = fade.legs(now, effector, body, sensed.weight, state)
         return (state, jnp.ones_like(started)), (body, weight)
@@ -169,9 +169,9 @@ def test_the_fade_is_that_of_the_reference():
     tilts = np.linalg.norm(sensed.ground.ankle.normal - sensed.leg_up_ws[:, None], axis=-1)
     turned = np.asarray(jax.vmap(lambda sensed: sensed.turned)(trace.sensed))
     memory, largest_gap = None, 0.0
-    for i in range(len(sensed.dt)):
+    for i in range(len(sensed.weight)):
         wish = reference.Wish(
-            dt=float(sensed.dt[i]),
+            dt=1.0 / HZ,
             up=sensed.up_ws[i],
             weights=sensed.weight[i],
             hips=sensed.hip_ws[i],
@@ -206,7 +206,7 @@ def test_weights_that_stay_leave_no_trace_of_the_fade():
 @pytest.mark.parametrize("noise", [1.2e-7, 1e-3])
 def test_weights_that_differ_by_noise_hold_the_body_back_by_as_little(noise):
     ground, trace = walked()
-    odd = (jnp.arange(len(trace.sensed.dt)) % 2)[:, None]
+    odd = (jnp.arange(len(trace.sensed.weight)) % 2)[:, None]
     weight = jnp.ones_like(trace.sensed.weight) - noise * odd
     sensed = dataclasses.replace(trace.sensed, weight=weight)
     body, faded_weight = faded(dataclasses.replace(trace, sensed=sensed), ground)
@@ -250,10 +250,12 @@ def test_gradients_of_the_fade_are_finite_where_nothing_has_to_be_corrected():
     assert np.abs(gradient.sensed.weight).max() > 0
 
 
-def moment(ground: Terrain, sensed: Sensed, **changes: jax.Array) -> SensedMoment:
+def moment(
+    ground: Terrain, sensed: Sensed, dt: float = 1.0 / HZ, **changes: jax.Array
+) -> SensedMoment:
     """A frame of `walked` as one that is not the first, with changes."""
     sensed = dataclasses.replace(sensed, **changes)
-    return SensedMoment(sensed.dt, jnp.asarray(True), HARD, sensed, ground)
+    return SensedMoment(jnp.asarray(dt), jnp.asarray(True), HARD, sensed, ground)
 
 
 def test_a_foot_that_swings_joins_its_animation_faster_by_its_own_speed():
@@ -268,7 +270,7 @@ def test_a_foot_that_swings_joins_its_animation_faster_by_its_own_speed():
     def steps(foot_speed: float, weight: float) -> np.ndarray:
         """How far the weights of the legs move from 1 towards this weight in a frame."""
         swings = {"foot_speed": jnp.full(2, foot_speed), "weight": jnp.ones(2)}
-        now = moment(ground, sensed, dt=jnp.asarray(1e-3), **swings)
+        now = moment(ground, sensed, dt=1e-3, **swings)
         return 1.0 - np.asarray(fade.legs(now, effector, body, jnp.full(2, weight), state)[1])
 
     assert (steps(0.0, 0.0) > 1e-4).all() and (steps(2.0, 0.0) < 1.0).all()
@@ -279,7 +281,7 @@ def test_a_foot_that_swings_joins_its_animation_faster_by_its_own_speed():
 def test_a_change_of_a_weight_holds_the_body_back_in_proportion():
     """By a leg's length for a full one; then the lag closes at the speed of the fade."""
     ground, trace = walked()
-    now = moment(ground, at(trace.sensed, 10), dt=jnp.asarray(0.01), weight=jnp.ones(2))
+    now = moment(ground, at(trace.sensed, 10), dt=0.01, weight=jnp.ones(2))
     reach, fade = float((now.sensed.thigh + now.sensed.shin).max()), SpeedFade()
     start = dataclasses.replace(fade.init(to_rig(RIG)), weight=jnp.ones(2))
     goal = Transform(jnp.array([0.0, 0.2, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]))
