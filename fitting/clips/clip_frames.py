@@ -194,8 +194,9 @@ def clip_from_result(
     solved_joints = {
         joint: (np.asarray(transform.pos)[:, leg], np.asarray(transform.rot)[:, leg])
         for leg, joints in enumerate(clip.rig.joints)
+        # A foot that ends at its ankle has that for its toe, which does not bend it.
         for joint, transform in zip(
-            joints, (solved.hip, solved.knee, solved.ankle, solved.toe), strict=True
+            joints[::-1], (solved.toe, solved.ankle, solved.knee, solved.hip), strict=True
         )
     }
     positions_ls, rotations_ls = local_from_world(

@@ -204,10 +204,12 @@ def pose(
         leg = ik.leg.pose(inputs, sensed, LegGoal(moved, target_ms, effector.weight))
     with jax.named_scope("foot"):
         foot = ik.foot.pose(inputs, sensed, effector, leg)
+        if ik.foot.bend_toes:
+            foot = ik.foot.with_toes(inputs, sensed, effector.weight, foot)
     spine, head = (
         None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
-    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch)
+    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch, foot.toe)
     advanced_ws = dataclasses.replace(_in_world(inputs, advanced), state=advanced.state)
     trace = Trace(_in_world(inputs, sensed), advanced_ws)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)

@@ -115,6 +115,8 @@ class Corrections:
     stretch: Float[Array, "*b legs"] | None = None
     """Not a rotation: the length of thigh and shin as a multiple of the animated one. None if the
     leg rule stretches none."""
+    toe: Float[Array, "*b legs 4"] | None = None
+    """Of the toe joints, local as those of the legs. None if the foot rule does not bend them."""
 
 
 @struct

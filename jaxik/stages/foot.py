@@ -1,5 +1,6 @@
 """Stage 11: ankle rotations that align the feet with the ground."""
 
+import dataclasses
 from abc import abstractmethod
 
 import jax.numpy as jnp
@@ -7,19 +8,20 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, angle, length, ratio, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, angle, length, option, ratio, switch
+from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
 from jaxik.solvers.pole import PoleTarget
-from jaxik.solvers.rotations import rotation_about
+from jaxik.solvers.rotations import local_correction, rotation_about
 from jaxik.world.frame import FORWARD, UP, Frame, GroundHits, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Transform
-from jaxik.world.terrain import Hit
+from jaxik.world.terrain import Hit, cast
 
 from .effector import Effector
 from .inputs import Inputs
 from .leg import SolvedLeg, is_full
-from .probe import foot_heading
+from .probe import climb, foot_heading
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
 FRACTION_BAND = 0.05  # width of softened limits, as a fraction of the angle
@@ -27,6 +29,9 @@ MIN_FRACTION = 0.01  # smaller angles count as this fraction of their limit
 SAME_ANGLE = 1e-6  # rad, below which a limit counts as inactive
 MIN_SOLE = 0.01  # m, horizontal distance of two hits that give a pitch
 LEFT = (1.0, 0.0, 0.0)  # foot axes
+# Of the length of the toes: the highest ball over its sole that counts; a step under their tips
+# that they bend to in full, and over how much more they bend to it less; how far their rays look.
+HIGHEST_BALL, SAME_STEP, STEP_FADE, RAY = 0.9, 0.7, 0.4, 4.0
 
 
 @struct
@@ -39,10 +44,26 @@ class SolvedFoot:
     """Local correction, right-multiplied."""
     reached: Float[Array, " legs"]
     """1 where the foot has the rotation its rule wants, else 0."""
+    toe: Float[Array, "legs 4"] | None = None
+    """Local correction, likewise; None where toes do not bend."""
 
 
 class AbstractFoot(Rule):
-    """Turns the feet to the ground."""
+    """Turns the feet to the ground and, with `bend_toes` on, the toes.
+
+    Toes then turn about their joint, the ball, across the foot, as far as their foot stands: they
+    keep the angle to the ground that they have to the floor of their animation, whatever pitch
+    their foot gets, as where its heel rises. The ground is where a ray meets it `toe_length` ahead
+    of the ball. A step there, up or down, bends them to it; where it is higher than they are long,
+    as over an edge, the ground counts as going on as it is under the foot.
+    """
+
+    toe_length: Leaf = length(0.07, 0.02, 0.15, "Distance from the ball to the tip of the toes.")
+    max_toe_up: Leaf = angle(1, 0, 1.4, "Largest angle by which toes bend up from their foot.")
+    max_toe_down: Leaf = angle(0.5, 0, 1, "Largest angle by which toes bend down from their foot.")
+    bend_toes: bool = option(
+        False, "Whether toes turn about their joint so that they stay on the ground."
+    )
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
@@ -53,6 +74,45 @@ class AbstractFoot(Rule):
         self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
         """The solved legs with their feet turned."""
+
+    def with_toes(
+        self, inputs: Inputs, sensed: Sensed, weight: Array, foot: SolvedFoot
+    ) -> SolvedFoot:
+        """The feet with their toes on the ground, as far as they stand and have foot IK, 0..1."""
+        world, up, ahead = inputs.frame.world_from_model, sensed.leg_up_ws, sensed.ahead_ws
+        ankle_rot_ws = world.apply_rot(foot.pose.ankle.rot)
+        from_animated = quat.multiply(ankle_rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        sole, hinge = (quat.rotate(from_animated, x) for x in (ahead, vec.cross(ahead, up)))
+        rise = vec.dot(sole, up)
+        pitch = vec.safe_arctan2(rise, vec.length(sole - vec.scale(up, rise)))
+        way = vec.scale(vec.across(sole, up, ahead), self.toe_length)
+        slope = self._slope_under_toes(inputs, sensed, world.apply(foot.pose.toe.pos), way)
+        bend = inputs.gate.clip(slope - pitch, -self.max_toe_down, self.max_toe_up, band=ANGLE_BAND)
+        bend *= weight * sensed.contact.weight * sensed.ground.ankle.found
+        turn = world.inverse().turn_rot(quat.from_axis_angle(hinge, bend))
+        toe = foot.pose.toe
+        pose = dataclasses.replace(foot.pose, toe=Transform(toe.pos, quat.multiply(turn, toe.rot)))
+        return dataclasses.replace(foot, pose=pose, toe=local_correction(toe.rot, turn))
+
+    def _slope_under_toes(
+        self, inputs: Inputs, sensed: Sensed, ball_ws: Array, way: Array
+    ) -> Array:
+        """Angle at which toes rise that lie on the ground, rad; `way` leads to their tips, m."""
+        up, size = sensed.leg_up_ws, self.toe_length
+        height = sensed.contact.lift - vec.dot(sensed.ankle_ws - sensed.ball_ws, up)
+        sole = jnp.where(height > 0, height, 0.0)
+        sole = jnp.where(sole > HIGHEST_BALL * size, HIGHEST_BALL * size, sole)
+        start = ball_ws + way + vec.scale(up, size)
+        hit = cast(inputs.terrain, start, RAY * size + sole, sensed.ground.rays.layers)
+        # Of a sole as far below the ball as in the animation.
+        even = climb(sensed.ground.ankle.normal, way, up)
+        even -= sole * jnp.sqrt(1.0 + vec.safe_divide(even, size) ** 2)
+        step = vec.dot(hit.point - ball_ws, up) + height - sole - even
+        excess = jnp.abs(step) - SAME_STEP * size
+        same = 1.0 - smoothstep(vec.safe_divide(excess, STEP_FADE * size))
+        rise = even + hit.found * same * step
+        across = vec.safe_sqrt(size * size + rise * rise - sole * sole)
+        return vec.safe_arctan2(rise, size) + vec.safe_arctan2(sole, across)
 
 
 class AbstractAnimatedFoot(AbstractFoot):

@@ -61,7 +61,8 @@ class Row(NamedTuple):
             frames = frames.with_platforms(Transform(jnp.zeros((FRAMES, 1, 3)), rot))
         ground = clips.to_terrain(dataclasses.replace(self.ground, platform=0))
         gate = Either(jnp.asarray(self.softness > 0.0), Smooth(self.softness or 1.0))
-        return to_ik(self.values), self.rig, ground, frames, gate
+        ik = parameter_tree.with_option(to_ik(self.values), "foot.bend_toes", True)
+        return ik, self.rig, ground, frames, gate
 
 
 @functools.cache
@@ -306,8 +307,13 @@ def test_bones_keep_their_lengths(name):
 def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     result, frames = result_of(name), wander()
     carried = jax.vmap(lambda pose, body: pose.transformed(body))(frames.pose, result.body)
-    hip_turn = quat.multiply(result.pose.hip.rot, quat.conjugate(carried.hip.rot))
-    for joint, parent_turn in (("hip", quat.identity()), ("knee", hip_turn)):
+    hip_turn, foot_turn = (
+        quat.multiply(getattr(result.pose, x).rot, quat.conjugate(getattr(carried, x).rot))
+        for x in ("hip", "ankle")
+    )
+    turns = {"hip": quat.identity(), "knee": hip_turn, "toe": foot_turn}
+    assert np.abs(np.asarray(result.corrections.toe)[..., 1:]).max() > 0.1
+    for joint, parent_turn in turns.items():
         turned = quat.multiply(
             quat.multiply(parent_turn, getattr(carried, joint).rot),
             getattr(result.corrections, joint),

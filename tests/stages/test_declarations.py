@@ -33,6 +33,8 @@ SpeedFade: speed m/s 0.5 0.1 3
 AimFoot: offset m 0,0,0 -0.2 0.2
 AimFoot PoleLeg TwoBone: twist rad 0 -1 1; weight 1 1 0 1
 PoleLeg TwoBone: max_stretch 1 1.05 1 1.3
+AimFoot FlatFoot KeepFoot PitchRollFoot: toe_length m 0.07 0.02 0.15; max_toe_up rad 1 0 1.4;
+  max_toe_down rad 0.5 0 1
 FlatFoot: max_tilt rad 0.7853982 0 1.5
 PitchRollFoot: max_pitch rad 0.52 0 1.4; min_pitch rad -0.79 -1.4 0; max_roll rad 0.26 0 1;
   min_roll rad -0.52 -1 0
@@ -135,15 +137,18 @@ stride: LabelContact; KeepRoot; StrideWarp;
 WORDS = {"yes": 1.0, "no": 0.0}
 
 SWITCHES = """
-AimFoot.enabled=yes BodyEffector.by_contact=no BodyEffector.latch=no CapsulePelvis.enabled=yes
+AimFoot.bend_toes=no AimFoot.enabled=yes BodyEffector.by_contact=no BodyEffector.latch=no
+CapsulePelvis.enabled=yes
 CornerProbe.active=yes CornerProbe.by_height=yes CornerProbe.by_speed=no
 CornerProbe.check_support=no CornerProbe.limited=yes DirectEffector.by_contact=no
 DirectEffector.if_found=no
-FadeEffector.by_contact=no FootProbe.check_support=no FootProbe.limited=yes FootProbe.use_toe=yes
+FadeEffector.by_contact=no FlatFoot.bend_toes=no FootProbe.check_support=no
+FootProbe.limited=yes FootProbe.use_toe=yes
 GroundRoot.enabled=yes HeelEffector.by_contact=no
 LegLengthPelvis.damp=yes LegLengthPelvis.enabled=yes LowestPelvis.enabled=yes
 LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=yes
-OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.allow_stretch=no PoleLeg.enabled=yes
+OffsetLock.hold_ball=no PlantLock.plant=yes KeepFoot.bend_toes=no
+PitchRollFoot.bend_toes=no PoleLeg.allow_stretch=no PoleLeg.enabled=yes
 PoleLeg.to_hint=no ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes

@@ -10,12 +10,16 @@ import numpy as np
 from fitting.runtime.precision import with_floats
 from jaxik.maths import quat
 from jaxik.maths.gate import HARD
+from jaxik.stages.foot import KeepFoot, SolvedFoot
+from jaxik.stages.inputs import Inputs
 from jaxik.stages.leg import LegGoal, TwoBone
+from jaxik.world import terrain
+from jaxik.world.frame import Contact, Frame, GroundHits, Rays, Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
+from jaxik.world.terrain import Hit
 from support.cases import Either
 from support.fragments import fragment
 from support.gradients import (
-    assert_finite_in_single_precision,
     assert_gradients_match,
     finite_jacobian,
 )
@@ -86,4 +90,118 @@ def test_a_stretched_leg_has_right_and_finite_derivatives():
             finite_jacobian(of_leg, straight, target, blurred)
     rows = np.array([reach * WAY, 0.0 * WAY, 1.02 * reach * WAY])
     single = with_floats(LEG, np.dtype(np.float32))
-    assert_finite_in_single_precision(lambda target: solved(single, target[None])[:3], rows)
+    rounded = solve(single, jnp.asarray(rows, jnp.float32), jnp.ones(3, jnp.float32))
+    for actual, exact in zip(rounded[:3], solve(LEG, jnp.asarray(rows), jnp.ones(3)), strict=False):
+        assert actual.dtype == jnp.float32
+        np.testing.assert_allclose(actual, exact, rtol=0, atol=1e-3)
+
+
+# Toes that bend. Each foot stands on a strip of ground of its own, 1 m wide, with its ball over
+# z = 0: the ground rises evenly and has a step 3 cm ahead of the ball.
+
+TOES, SOLE = 0.07, 0.05  # m, from the ball to their tips, and of the ball over its sole
+SLOPES = np.array([0.0, 0.0, 0.3, -0.3, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+STEPS = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.03, -0.02, 0.2, -0.5, 0.045])
+RAISED = np.array([0.0, 0.5, 0.0, 0.0, 0.4, 0.0, 0.3, 0.4, 0.4, 0.0])  # rad, of the heels
+LEGS = len(STEPS)
+
+
+def height_of(slopes, steps, x, z):
+    strip = jnp.clip(jnp.floor(x).astype(int), 0, LEGS - 1)
+    return slopes[strip] * z + jnp.where(z > 0.03, steps[strip], 0.0)
+
+
+def bent(rule, slopes, steps, raised, weight=1.0, gate=HARD):
+    """The rotations of toes (legs 4), and their corrections; feet are turned by slope and heel."""
+    floats = slopes.dtype
+    up = jnp.asarray([0.0, 1.0, 0.0], floats)
+    zero, ones = jnp.zeros_like(slopes), jnp.ones_like(slopes)
+    pitch = jnp.arctan(slopes)
+    # A flat foot on its slope, with the heel raised about the ball.
+    rot = quat.from_axis_angle(jnp.asarray([-1.0, 0.0, 0.0], floats), pitch - raised)
+    normal = jnp.stack([zero, jnp.cos(pitch), -jnp.sin(pitch)], axis=-1)
+    place = jnp.stack([jnp.arange(LEGS) + 0.5 * ones, zero, zero], axis=-1)
+    ball = place + SOLE * normal
+    still = zero[:, None] + quat.identity(floats)
+    joint = Transform(ball, rot)
+    foot = SolvedFoot(LegPose(joint, joint, joint, joint), still, ones)
+    ground = terrain.function(jax.tree_util.Partial(height_of, slopes, steps), dtype=floats)
+    hits = fragment(Hit, normal=normal, found=ones)
+    sensed = fragment(
+        Sensed,
+        leg_up_ws=up,
+        ahead_ws=0.0 * place + jnp.asarray([0.0, 0.0, 1.0], floats),
+        ankle_rot_ws=still,
+        ankle_ws=place + (SOLE + 0.03) * up,
+        ball_ws=place + SOLE * up,
+        contact=fragment(Contact, lift=SOLE + 0.03 * ones, weight=ones),
+        ground=fragment(GroundHits, ankle=hits, rays=fragment(Rays, layers=jnp.uint32(1))),
+    )
+    frame = fragment(Frame, world_from_model=Transform.identity(floats))
+    inputs = fragment(Inputs, frame=frame, terrain=ground, gate=gate)
+    foot = rule.with_toes(inputs, sensed, weight * ones, foot)
+    return foot.pose.toe.rot, foot.toe
+
+
+bend = jax.jit(bent)
+
+
+def lying_toes(slope: float, step: float) -> float:
+    """The pitch, rad, at which the sole of toes just touches the ground ahead, by bisection."""
+    ball = SOLE * np.array([-np.sin(np.arctan(slope)), np.cos(np.arctan(slope))])  # z, y
+    ahead = ball[0] + TOES
+    ground = np.array([ahead, slope * ahead + step])
+
+    def over(pitch: float) -> float:  # of the ground over the toes' sole
+        normal = np.array([-np.sin(pitch), np.cos(pitch)])
+        return normal @ (ground - ball) + SOLE
+
+    low, high = -1.5, 1.5
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if over(middle) > 0 else (low, middle)
+    return low
+
+
+def pitch_of(rots: np.ndarray) -> np.ndarray:
+    """Pitch of toes, rad, positive where they rise."""
+    ahead = np.asarray(quat.rotate(jnp.asarray(rots), jnp.asarray([0.0, 0.0, 1.0])))
+    return np.arctan2(ahead[:, 1], ahead[:, 2])
+
+
+def test_toes_stay_on_the_ground_under_a_raised_heel_on_slopes_and_steps():
+    rule = KeepFoot(toe_length=TOES, max_toe_up=1.2, max_toe_down=0.6)
+    arrays = [jnp.asarray(x) for x in (SLOPES, STEPS, RAISED)]
+    rots, corrections = map(np.asarray, bend(rule, *arrays))
+    # Ground that is too high or too low for the toes counts as going on.
+    near = np.where(np.abs(STEPS) > 0.1, 0.0, STEPS)
+    expected = [lying_toes(*ground) for ground in zip(SLOPES, near, strict=True)]
+    np.testing.assert_allclose(pitch_of(rots), expected, atol=1e-6)
+    assert np.abs(np.diff(expected)).max() > 0.3
+    feet = np.arctan(SLOPES) - RAISED
+    bends = 2.0 * np.arctan2(-corrections[:, 1], corrections[:, 0])
+    np.testing.assert_allclose(bends, expected - feet, atol=1e-6)
+    np.testing.assert_allclose(bends[[0, 2, 3]], 0.0, atol=1e-6)
+
+    small = KeepFoot(toe_length=TOES, max_toe_up=0.2, max_toe_down=0.1)
+    limited = np.asarray(bend(small, *arrays)[0])
+    expected = np.clip(expected - feet, -0.1, 0.2) + feet
+    np.testing.assert_allclose(pitch_of(limited), expected, atol=1e-6)
+    np.testing.assert_array_equal(bend(rule, *arrays, 0.0)[1], np.eye(4)[[0] * LEGS])
+
+
+def test_bent_toes_have_right_and_finite_derivatives_in_both_precisions():
+    def of_feet(values, ground, blurred):
+        return bent(KeepFoot(**values), *ground, gate=Either(blurred > 0.5))[0]
+
+    values = {"toe_length": TOES, "max_toe_up": 1.2, "max_toe_down": 0.6}
+    ground = (SLOPES + 0.01, STEPS + 0.003, RAISED + 0.02)
+    for blurred in (0.0, 1.0):
+        assert_gradients_match(of_feet, values, ground, blurred)
+        for raised in (0.0 * RAISED, 0.0 * RAISED + np.pi / 2):
+            finite_jacobian(of_feet, values, (0.0 * SLOPES, 0.0 * STEPS, raised), blurred)
+    arrays = [jnp.asarray(x) for x in (SLOPES, STEPS, RAISED)]
+    single = with_floats((KeepFoot(), *arrays, jnp.ones(())), np.dtype(np.float32))
+    for rounded, exact in zip(bend(*single), bend(KeepFoot(), *arrays, jnp.ones(())), strict=True):
+        assert rounded.dtype == jnp.float32
+        np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-5)

@@ -210,9 +210,10 @@ OVER = "probe.lift_over"  # in `test_stride`, as planes make no hurdle
 SOLES = ("probe.clearance", "probe.heel_length", "probe.toe_length")  # likewise
 SWITCHES = ("pelvis.enabled", "effector.by_contact", "effector.if_found")  # of `ozz`, too
 CONSTANTS = ("probe.uneven_height", "probe.highest_step")
+OPTIONAL = ("warp.", "leg.max_stretch", "foot.toe_length", "foot.max_toe_")
 IN_OWN_TESTS = {
-    "record": ("warp.", "probe.max_", "probe.step_fade", "probe.layers", *WIDTHS, *SWITCHES),
-    "stride": ("warp.", "lean.", "separation.", *WIDTHS, OVER, *SOLES, *CONSTANTS),
+    "record": (*OPTIONAL, "probe.max_", "probe.step_fade", "probe.layers", *WIDTHS, *SWITCHES),
+    "stride": (*OPTIONAL, "lean.", "separation.", *WIDTHS, OVER, *SOLES, *CONSTANTS),
 }
 STRIDE, SPEED = (pytest.param(name, marks=pytest.mark.slow) for name in ("stride", "by speed"))
 

@@ -176,8 +176,9 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 LARGE = "ozz", "mec"  # whose derivatives take long to compile
-# In `test_own_rules`, `test_limits` and `tests/pipeline/test_situations.py`.
+# In `test_own_rules`, `test_limits`, `test_foot_placement` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
+IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_")
 
 
 @functools.cache

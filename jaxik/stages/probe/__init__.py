@@ -14,4 +14,5 @@ from .games import CornerProbe as CornerProbe
 from .games import FootProbe as FootProbe
 from .games import RootProbe as RootProbe
 from .limits import AbstractLimitedProbe as AbstractLimitedProbe
+from .limits import climb as climb
 from .stride import StrideProbe as StrideProbe
