@@ -83,6 +83,18 @@ NEAR_IN_WORDS = "ankles 1.0 cm, knees 1.0 cm, pelvis 1.0 cm, orientation of the 
             f"{ANKLES_WORSE} without foot IK, and in 1 more of the distances below. The parameters "
             "of the fit are",
         ),
+        (  # a turn of 6 mm at heel and tip, of a foot that is 8 mm nearer, and then 2 mm
+            of({"foot": 0.06, "ankle": 0.012}, {"foot": 0.0, "ankle": 0.02}, {"foot": 0.06}),
+            [],
+            "fitted",
+            "Fits: ankles 1.2 cm",
+        ),
+        (
+            of({"foot": 0.06, "ankle": 0.012}, {"foot": 0.0, "ankle": 0.014}, {"foot": 0.06}),
+            [("foot", "animation")],
+            "fitted",
+            "Worse: orientation of the feet 3.4° off the capture in fitted frames, 0.0° without",
+        ),
         (  # however much nearer the ankles are
             of({"pelvis": 0.013}, {"ankle": 0.1}, {"ankle": 0.05}),
             [("pelvis", "animation"), ("pelvis", "before")],
