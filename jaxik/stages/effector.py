@@ -1,9 +1,7 @@
 """Stage 9: where each leg goes once the body has moved, and how much foot IK it gets."""
 
 from abc import abstractmethod
-from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -44,16 +42,13 @@ class Effector:
     """0..1, how much of its weight each leg gets."""
 
 
-def _contact_switch() -> Any:
-    doc = "Whether a foot gets as much foot IK as its contact, so that it swings as animated."
-    return switch(False, doc)
-
-
 class AbstractEffector(Rule):
     """Turns the targets of the feet into those of the legs."""
 
-    by_contact: eqx.AbstractVar[Array]
-    """Whether each leg's weight has its contact as a factor."""
+    by_contact: Leaf = switch(
+        False,
+        "Whether a foot gets as much foot IK as its contact, so that it swings as animated.",
+    )
 
     def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame; None for a rule that goes by each frame alone."""
@@ -84,7 +79,6 @@ class DirectEffector(AbstractEffector):
     """
 
     if_found: Leaf = switch(False, "Whether only feet that found ground get foot IK.")
-    by_contact: Leaf = _contact_switch()
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -109,8 +103,6 @@ class HeelEffector(AbstractEffector):
         0.98, 0.8, 1, "Part of its length to which a leg stretches before the heel rises."
     )
     max_lift: Leaf = angle(0.6, 0, 1.2, "Largest angle by which the heel is lifted.")
-
-    by_contact: Leaf = _contact_switch()
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -210,8 +202,6 @@ class BodyEffector(AbstractEffector):
         0.01, 0, 0.05, "Distance from its goal within which a foot counts as arrived.", unit="m"
     )
 
-    by_contact: Leaf = _contact_switch()
-
     def init(self, rig: Rig) -> BodyState:
         return BodyState(jnp.zeros_like(rig.side), jnp.zeros((), rig.side.dtype))
 
@@ -267,8 +257,6 @@ class FadeEffector(AbstractEffector):
     """
 
     transition_time: Leaf = duration(0.2, 0, 1, "Time in which foot IK of a leg fades in or out.")
-
-    by_contact: Leaf = _contact_switch()
 
     def init(self, rig: Rig) -> FadeState:
         identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
