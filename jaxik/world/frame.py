@@ -218,7 +218,7 @@ class Sensed:
     side: Float[Array, " legs"]
     """+1 left, -1 right, 0 in the middle."""
     weight: Float[Array, " legs"]
-    """0..1, how much foot IK each leg gets."""
+    """0..1, `Frame.weight` by `Frame.grounded` by `leg.weight`; `phases.advance` has the rest."""
     grounded: Float[Array, ""]
     """0..1, how much of its motion the body gets; the weights have it as a factor."""
     root_ws: Float[Array, "3"]
