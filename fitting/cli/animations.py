@@ -1,6 +1,7 @@
 """Commands that run systems on flat animations."""
 
 import argparse
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,6 +77,11 @@ def _terrain(*, required: bool = True) -> tuple[Option, ...]:
             help="let the root travel X times as far as in the clip; strides are scaled with it",
         ),
         argument(
+            "--direction", type=number(-90, 90, "degrees"), default=0.0, metavar="DEG",
+            help="let the root travel that far to the left of its way in the clip; feet and pelvis "
+            "are turned with it, the spine back",
+        ),
+        argument(
             "--tracks", type=Path, metavar="TOML",
             help="what changes along the clip: grounded, weights of legs, and any parameter",
         ),
@@ -85,9 +91,9 @@ def _terrain(*, required: bool = True) -> tuple[Option, ...]:
 
 
 OF_CLIPS = (  # options of a clip and its terrain
-    "--floor", "--root", "--speed", "--tracks", "--joints", "--scale", "--up", "--asf",
-    "--animation", "--travel", "--sole", "--file-up", "--terrain-offset", "--terrain-scale",
-    "--terrain-cell",
+    "--floor", "--root", "--speed", "--direction", "--tracks", "--joints", "--scale", "--up",
+    "--asf", "--animation", "--travel", "--sole", "--file-up", "--terrain-offset",
+    "--terrain-scale", "--terrain-cell",
 )  # fmt: skip
 
 
@@ -317,4 +323,5 @@ def _animation(options: argparse.Namespace) -> "AnimationFiles":
         options.tracks,
         clip_options(options),
         terrain_options(options),
+        math.radians(options.direction),
     )

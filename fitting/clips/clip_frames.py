@@ -27,6 +27,7 @@ def frames_from_clip(
     up_ws: Direction = UP,
     rise: Float64[np.ndarray, " frames"] | None = None,
     stride_scale: float | None = None,
+    orientation: float | None = None,
 ) -> jaxik.Frame:
     """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
 
@@ -42,6 +43,8 @@ def frames_from_clip(
             stay those of the animation on its floor.
         stride_scale: by which strides are to be scaled, where the clip's root is as much faster
             than its feet step (`clips.edit.at_speed`); None leaves them as animated.
+        orientation: rad, from the direction in which the clip's feet step to that in which its root
+            moves (`clips.edit.in_direction`), positive to the left; None leaves them as animated.
 
     Raises:
         ValueError: the clip has no legs.
@@ -50,17 +53,23 @@ def frames_from_clip(
     pose = _model_from_world(world, clip.leg_pose_ws())
     legs = len(clip.rig.joints)
     dtype = world.pos.dtype
-    balls = clip.joints_ws(3)
-    moved = _scaled_strides(np.asarray(world.pos), balls, up_ws, stride_scale)
+    root_ws = np.asarray(world.pos)
+    ankles, balls = (
+        _turned(clip.joints_ws(index), root_ws, up_ws, orientation or 0.0) for index in (2, 3)
+    )
+    moved = _scaled_strides(root_ws, balls, up_ws, stride_scale)
     root_velocity, ankle_velocity, toe_velocity = (
         np.concatenate([_velocity(positions[piece], clip.fps) for piece in clip.pieces])
-        for positions in (np.asarray(world.pos), clip.joints_ws(2) + moved, balls + moved)
+        for positions in (root_ws, ankles + moved, balls + moved)
     )
     slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
     weight = np.ones((clip.frame_count, legs)) if clip.weight is None else clip.weight
 
     def array(values: np.ndarray) -> Array:
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
+
+    def everywhere(value: float | None) -> Array | None:
+        return None if value is None else array(np.full(clip.frame_count, float(value)))
 
     labels = clip.stance_labels()
     strides = [_stride(labels[at], (balls + moved)[at], up_ws) for at in clip.pieces]
@@ -78,9 +87,8 @@ def frames_from_clip(
         dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
         platforms=none,
         platforms_before=none,
-        stride_scale=None
-        if stride_scale is None
-        else array(np.full(clip.frame_count, float(stride_scale))),
+        stride_scale=everywhere(stride_scale),
+        orientation=everywhere(orientation),
         restart=jax.device_put(np.isin(np.arange(clip.frame_count), clip.cuts))
         if clip.cuts
         else None,
@@ -123,6 +131,17 @@ def _velocity(positions: np.ndarray, fps: float) -> np.ndarray:
     """Velocity of points (frames, ..., 3) since the previous frame, m/s; the first repeats."""
     steps = np.diff(positions, axis=0) * fps
     return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(positions.shape)
+
+
+def _turned(
+    points_ws: np.ndarray, root_ws: np.ndarray, up_ws: Direction, angle: float
+) -> Float64[np.ndarray, "frames legs 3"]:
+    """Points of the feet turned about the root's up by an angle, rad."""
+    if angle == 0.0:
+        return points_ws
+    turn = Rotation.from_rotvec(angle * np.asarray(up_ws, np.float64))
+    arms = points_ws - root_ws[:, None]
+    return root_ws[:, None] + turn.apply(arms.reshape(-1, 3)).reshape(arms.shape)
 
 
 def _scaled_strides(
@@ -174,7 +193,8 @@ def clip_from_result(
 
     Hips, knees, ankles and toes are the solved ones. Joints below them stay rigid on their parents,
     and all others move with the body. Where the system bends the spine, its base and the head turn,
-    as far as the skeleton has these joints (`joint_maps.find_trunk`).
+    as far as the skeleton has these joints (`joint_maps.find_trunk`), and the joints of the spine
+    share the twist against a turned pelvis.
 
     Args:
         clip: the clip from which `frames_from_clip` made the frames.
@@ -216,14 +236,15 @@ def clip_from_result(
             positions_ws[:, joint] = body_pos + body_rot.apply(positions_ws[:, joint])
             rotations_ws[:, joint] = _wxyz(body_rot * rotation(rotations_ws[:, joint]))
     trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
-    if result.corrections.spine is not None and trunk.spine is not None:
-        upright = rotation(world.rot)
-        turns = {trunk.spine: result.corrections.spine, trunk.head: result.corrections.head}
-        for joint, turn_ms in turns.items():
-            if joint is not None and turn_ms is not None:
-                turn_ws = upright * rotation(turn_ms) * upright.inv()
-                above = _with_descendants(joint, clip.parents)
-                _turn(turn_ws, positions_ws, rotations_ws, above)
+    corrections, upright = result.corrections, rotation(world.rot)
+    turns = [(joint, corrections.twist, 1.0 / len(trunk.twisted)) for joint in trunk.twisted]
+    if trunk.spine is not None:
+        turns += [(trunk.spine, corrections.spine, 1.0), (trunk.head, corrections.head, 1.0)]
+    for joint, turn_ms, share in turns:
+        if joint is not None and turn_ms is not None:
+            turn_ws = upright * rotation(turn_ms) ** share * upright.inv()
+            above = _with_descendants(joint, clip.parents)
+            _turn(turn_ws, positions_ws, rotations_ws, above)
     return clip.with_motion(positions_ws, rotations_ws)
 
 

@@ -77,6 +77,31 @@ def at_speed(clip: Clip, factor: float) -> Clip:
     return replace(faster, stance=clip.stance_labels())
 
 
+def in_direction(clip: Clip, angle: float) -> Clip:
+    """The clip over a root that travels in another direction, but faces where it did.
+
+    The pose of each frame is the same, so that standing feet skate; feet that are turned by the
+    same angle bring them to rest (`frames_from_clip`). Contact labels stay those of the clip.
+
+    Args:
+        clip: with legs.
+        angle: rad, by which the way of the root turns to the left, up to a right angle.
+
+    Raises:
+        ValueError: `angle` is beyond a right angle, or the clip has no legs.
+    """
+    if not abs(angle) <= 0.5 * np.pi + 1e-9:
+        raise ValueError(
+            f"the direction is {np.degrees(angle):g} degrees to the clip's; wanted -90 to 90: "
+            "beyond, play an animation that goes the other way"
+        )
+    root = clip.positions_ws[:, clip.rig.pelvis]
+    way = (root - root[0]) * [1.0, 0.0, 1.0]
+    aside = Rotation.from_rotvec([0.0, angle, 0.0]).apply(way) - way
+    turned = clip.with_motion(clip.positions_ws + aside[:, None], clip.rotations_ws)
+    return replace(turned, stance=clip.stance_labels())
+
+
 def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
     """The frames from `start` to `end`, s, both included.
 

@@ -124,6 +124,8 @@ class Trunk:
     spine: int | None
     """Base of the spine: the first joint from the pelvis to the head."""
     head: int | None
+    twisted: tuple[int, ...] = ()
+    """The joints of the spine that share a twist, from its base up to where the arms branch off."""
 
 
 def find_trunk(names: tuple[str, ...], parents: tuple[int, ...], pelvis: int) -> Trunk:
@@ -137,15 +139,21 @@ def find_trunk(names: tuple[str, ...], parents: tuple[int, ...], pelvis: int) ->
         spines = (
             j for j, name in enumerate(plain_names) if name in SPINES and parents[j] == pelvis
         )
-        return Trunk(next(spines, None), None)
+        spine = next(spines, None)
+        return Trunk(spine, None, () if spine is None else (spine,))
     head = spine = plain_names.index("head")
+    chain: list[int] = []
     below = {-1, pelvis}
     while parents[pelvis] >= 0:
         pelvis = parents[pelvis]
         below.add(pelvis)
     while parents[spine] not in below:
         spine = parents[spine]
-    return Trunk(None if spine == head or parents[spine] < 0 else spine, head)
+        chain.insert(0, spine)
+    if spine == head or parents[spine] < 0:
+        return Trunk(None, head)
+    branches = (n for n, joint in enumerate(chain, 1) if parents.count(joint) > 1)
+    return Trunk(spine, head, tuple(chain[: next(branches, None)]))
 
 
 def _without_prefix(plain_names: list[str], pelvis: int) -> list[str]:

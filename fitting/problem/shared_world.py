@@ -14,7 +14,7 @@ thousand lengths need a few programs.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -87,8 +87,12 @@ def row_of(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> Row:
     if len(scenes) == 1:
         return Row(own_system(ik, first), first.rig, first.terrain, first.frames, first.tracks)
     assert first.place is not None  # they share a world
-    scaled = any(scene.frames.stride_scale is not None for scene in scenes)
-    frames = in_a_row([_frames_in_world(scene, first.rig, scaled) for scene in scenes])
+    warped = {
+        name: jnp.asarray(neutral)
+        for name, neutral in (("stride_scale", 1.0), ("orientation", 0.0))
+        if any(getattr(scene.frames, name) is not None for scene in scenes)
+    }
+    frames = in_a_row([_frames_in_world(scene, first.rig, warped) for scene in scenes])
     return Row(ik, first.rig, first.place.terrain, frames, _tracks_in_a_row(ik, scenes))
 
 
@@ -122,6 +126,7 @@ def run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> jaxik.Result:
 def scene_in_a_row(scenes: Sequence[Scene]) -> Scene:
     """The scenes one after another, each in its own world; body and sigmas are those of frames."""
     first, plain = scenes[0], {"restart": None, "stride_scale": None, "rig": None}
+    plain |= {"orientation": None}
     parts = []
     for scene in scenes:
         each = jnp.broadcast_to(scene.sigmas.correlation, len(WHITENED))  # where all share one, too
@@ -192,16 +197,21 @@ def _moved(tree: Tree, scene: Scene, by_ws: Float[Array, "3"]) -> Tree:
     return places.moved(tree, by_ws, up_ws, up_ws)
 
 
-def _frames_in_world(scene: Scene, rig: jaxik.Rig, scaled: bool) -> jaxik.Frame:
-    """The frames of a scene in the shared world, each with its body."""
+def _frames_in_world(scene: Scene, rig: jaxik.Rig, warped: Mapping[str, Array]) -> jaxik.Frame:
+    """The frames of a scene in the shared world, each with its body.
+
+    Fields in `warped` have that value where the scene leaves them out.
+    """
     frames = moved_out(scene.frames, scene)
     begins = jnp.arange(len(frames.dt)) == 0
     restart = begins if frames.restart is None else frames.restart | begins
-    scale = frames.stride_scale
-    if scaled and scale is None:
-        scale = jnp.ones_like(frames.dt)
     bodies = _bodies(scene, rig)
-    return dataclasses.replace(frames, restart=restart, stride_scale=scale, rig=bodies)
+    neutral = {
+        name: value + jnp.zeros_like(frames.dt)
+        for name, value in warped.items()
+        if getattr(frames, name) is None
+    }
+    return dataclasses.replace(frames, restart=restart, rig=bodies, **neutral)
 
 
 def _tracks_in_a_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> dict[str, Array]:

@@ -26,7 +26,7 @@ from jaxtyping import Float64
 import jaxik
 from fitting.clips import Clip, flight, load_clip, save_clip
 from fitting.clips.clip_frames import clip_from_result, frames_from_clip, positions_by_role, raised
-from fitting.clips.edit import at_speed
+from fitting.clips.edit import at_speed, in_direction
 from fitting.clips.formats.npz import holds_base
 from fitting.clips.formats.saving import check_clip_file
 from fitting.clips.joint_maps import find_trunk
@@ -79,6 +79,8 @@ class AnimationFiles:
     """How the clip is read."""
     terrain_options: TerrainOptions = TerrainOptions()
     """How the terrain is read."""
+    direction: float = 0.0
+    """rad, by which the root's way turns to the left of the clip's; feet are turned alike."""
 
     @cached_property
     def flat_clip(self) -> Clip:
@@ -107,6 +109,8 @@ class Animation:
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
     speed: float = 1.0
     """Speed of the clip's root, as a multiple of that with which its feet step."""
+    direction: float = 0.0
+    """rad, of the way of the clip's root, to the left of that in which its feet step."""
     tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Parameters that change along the clip, (frames, ...) by dotted name."""
     given_frames: jaxik.Frame | None = None
@@ -121,11 +125,14 @@ class Animation:
         """The clip as the pipeline's input."""
         if self.given_frames is not None:
             return self.given_frames
-        stride_scale = None if self.speed == 1.0 else self.speed
         frames = frames_from_clip(
-            self.clip, floor=self.floor, rise=self.root.rise, stride_scale=stride_scale
+            self.clip,
+            floor=self.floor,
+            rise=self.root.rise,
+            stride_scale=None if self.speed == 1.0 else self.speed,
+            orientation=None if self.direction == 0.0 else self.direction,
         )
-        if stride_scale is None:
+        if not has_other_path(self):
             frames = with_cut_off_swings(frames, self.clip, self.terrain)
         return frames if self.carried is None else carried_frames(frames, self.carried)
 
@@ -228,14 +235,19 @@ class Animation:
 
     @cached_property
     def own_speed(self) -> Clip:
-        """The animation at its own speed, by which soles and slides are judged.
+        """The animation at its own speed and in its own direction, which soles are judged by.
 
-        With a faster root its standing feet skate, and measures must show that.
+        With another root its standing feet skate, and measures must show that.
         """
-        return at_speed(self.clip, 1.0 / self.speed)
+        return at_speed(in_direction(self.clip, -self.direction), 1.0 / self.speed)
 
     def _soles(self, solved: Clip) -> measures.Soles:
         return measures.soles(solved, self.own_speed, self.terrain, self.floor)
+
+
+def has_other_path(animation: AnimationFiles | Animation) -> bool:
+    """Whether the root goes faster, slower or elsewhere than in the clip's file."""
+    return animation.speed != 1.0 or animation.direction != 0.0
 
 
 def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
@@ -257,16 +269,16 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     if (to_fit or files.root == "ground") and covered.share < coverage.LITTLE:
         raise ValueError(covered.text())
     coverage.warn(covered)
-    if files.speed != 1.0:
-        clip = at_speed(clip, files.speed)
+    if has_other_path(files):
+        clip = in_direction(at_speed(clip, files.speed), files.direction)
     placed, root = place_root(clip, terrain, files.root, files.floor)
     # Where the clip follows this terrain, its ground has been taken out.
     clip = with_remark_if_uneven(clip) if placed is clip else placed
     captured = _captured(files, placed)
     clip, tracks = track_files.along(clip, files.tracks)
     return Animation(
-        clip, terrain, files.floor, root, speed=files.speed, tracks=tracks, captured=captured,
-        files=files,
+        clip, terrain, files.floor, root, speed=files.speed, direction=files.direction,
+        tracks=tracks, captured=captured, files=files,
     )  # fmt: skip
 
 
@@ -274,9 +286,9 @@ def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:
     """The captured motion of an animation, where the file of the clip has it.
 
     It may hold both motions, or a clip that follows the terrain, from which the ground was taken
-    out. At another speed, neither has the captured path.
+    out. On another path, neither has the captured one.
     """
-    if files.speed != 1.0:
+    if has_other_path(files):
         return None
     if holds_base(files.clip):
         return load_clip(files.clip)

@@ -547,6 +547,8 @@ def _setup(comparison: Comparison) -> Table:
     ]
     if animation.speed != 1.0:
         rows.append(["Speed", f"{animation.speed:g} times that of the clip"])
+    if animation.direction != 0.0:
+        rows.append(["Direction", f"{np.degrees(animation.direction):g}° to the clip's left"])
     if animation.tracks:
         rows.append(["Tracks", ", ".join(f"`{name}`" for name in animation.tracks)])
     if comparison.rates:

@@ -50,7 +50,7 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
     joints = (pose.hip, pose.knee, pose.ankle, pose.toe)
     of_legs = (frame.weight, frame.foot_speed, frame.toe_speed, frame.stride)
     whole = (frame.world_from_model, frame.grounded, frame.slide, frame.velocity_ws)
-    whole = (*whole, frame.stride_scale, frame.dt)
+    whole = (*whole, frame.stride_scale, frame.orientation, frame.dt)
     platforms = (frame.platforms, frame.platforms_before)
 
     joints_sound = [_is_sound(joint, rank + 1) for joint in joints]
@@ -70,7 +70,7 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
     joints, of_legs = _materialised((joints, _chosen(sound, of_legs)), rank + 1)
     whole = _materialised(_chosen(frame_sound, whole), rank)
     weight, foot_speed, toe_speed, stride = of_legs
-    world_from_model, grounded, slide, velocity_ws, stride_scale, dt = whole
+    world_from_model, grounded, slide, velocity_ws, stride_scale, orientation, dt = whole
     platforms, platforms_before = _chosen(frame_sound[..., None], platforms)
     cleaned = dataclasses.replace(
         frame,
@@ -87,6 +87,7 @@ def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults
         platforms=platforms,
         platforms_before=platforms_before,
         stride_scale=stride_scale,
+        orientation=orientation,
     )
     return cleaned, Faults(faulty, ~frame_sound)
 

@@ -156,6 +156,12 @@ class Clip(AbstractFrames):
 
             return Ahead(memory, jax.vmap(instant)(frames.dt, sensed, self.tracks))
 
+        if not jax.tree.leaves(sensed):  # a frame without what the stage goes by costs nothing
+            count = len(frames.dt)
+            return Ahead(
+                jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), memory), None
+            )
+
         def begin(rig: Rig) -> _MemoryAhead:
             started, centre_ws = (jnp.zeros_like(x) for x in (state.started, state.centre_ws))
             return _MemoryAhead(started, centre_ws, getattr(self.ik, stage).init(rig))

@@ -34,32 +34,49 @@ def solve(frames: AbstractFrames) -> tuple[State, Result]:
     """Memory after the last frame, and the result of each."""
     contact = frames.ahead("contact", lambda ik, inputs: ik.contact.sense(inputs))
     root = frames.ahead("root", lambda ik, inputs: ik.root.sense(inputs))
-    probe = frames.ahead("probe", watch, contact.output)
-    sensed = frames.each(sense, contact.output, root.output, probe.output)
-    ahead = contact.state, root.state, probe.state
+    warp = frames.ahead("warp", lambda ik, inputs: ik.warp.sense(inputs))
+    probe = frames.ahead("probe", watch, contact.output, warp.output)
+    sensed = frames.each(sense, contact.output, root.output, warp.output, probe.output)
+    ahead = contact.state, root.state, warp.state, probe.state
     after, advanced = frames.advance(advance, sensed, ahead)
     return after, frames.each(pose, sensed, advanced, frames.faults)
 
 
-def watch(ik: FootIK, inputs: Inputs, contact: Contact) -> PyTree:
+def watch(ik: FootIK, inputs: Inputs, contact: Contact, turn: Array | None) -> PyTree:
     """What the memory of the probe advances with; None if it has none."""
     if not jax.tree.leaves(ik.probe.init(inputs.rig)):
         return None  # and no stride is scaled in vain
-    return ik.probe.watch(_with_scaled_strides(ik, inputs)[0], contact)
+    return ik.probe.watch(_warped(ik, inputs, turn)[0], contact)
 
 
-def _with_scaled_strides(
-    ik: FootIK, inputs: Inputs
+def _warped(
+    ik: FootIK, inputs: Inputs, turn: Array | None
 ) -> tuple[Inputs, Float[Array, "legs 3"] | None]:
-    """The frame with its feet moved for the character's speed, and by how much, m."""
-    warp_ws = ik.warp.sense(inputs)
+    """The frame with its feet moved for the character's velocity, and by how much, m.
+
+    Feet that are turned by `turn`, rad, move from where the turned pelvis carries them.
+    """
+    before_ws = None
+    if turn is not None:
+        carried = ik.warp.with_turned_pelvis(inputs.frame, turn)
+        before_ws = animated_ankles(carried).pos
+        turned = ik.warp.with_turned_feet(carried, inputs.bearing, turn)
+        inputs = dataclasses.replace(inputs, frame=turned)
+    warp_ws = ik.warp.offset(inputs)
     if warp_ws is not None:
         inputs = dataclasses.replace(inputs, frame=inputs.frame.with_moved_feet(warp_ws))
+    if before_ws is not None:
+        warp_ws = animated_ankles(inputs.frame).pos - before_ws
     return inputs, warp_ws
 
 
 def sense(
-    ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""], stride: Stride | None
+    ik: FootIK,
+    inputs: Inputs,
+    contact: Contact,
+    rise: Float[Array, ""],
+    turn: Float[Array, ""] | None,
+    stride: Stride | None,
 ) -> Sensed:
     """Outputs of the stages that need no memory.
 
@@ -68,6 +85,7 @@ def sense(
         inputs: the frame.
         contact: which feet stand.
         rise: of the root, m.
+        turn: of the feet about the root's up, rad; None for none.
         stride: where the feet stood and will stand; None leaves what the animation says.
     """
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
@@ -80,7 +98,7 @@ def sense(
     inputs = dataclasses.replace(inputs, frame=frame)
     thigh, shin = bone_lengths(frame.pose)
     with jax.named_scope("warp"):
-        inputs, warp_ws = _with_scaled_strides(ik, inputs)
+        inputs, warp_ws = _warped(ik, inputs, turn)
         frame = inputs.frame
     with jax.named_scope("probe"):
         ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
@@ -115,11 +133,12 @@ def sense(
         foothold=foothold,
         slope=slope,
         warp_ws=warp_ws,
+        turn=turn,
     )
 
 
 def advance(
-    ik: FootIK, now: SensedMoment, state: State, ahead: tuple[PyTree, PyTree, PyTree]
+    ik: FootIK, now: SensedMoment, state: State, ahead: tuple[PyTree, PyTree, PyTree, PyTree]
 ) -> Advanced:
     """Memory after this frame, and the outputs of the stages that have some.
 
@@ -127,7 +146,7 @@ def advance(
         ik: the system.
         now: the sensed frame.
         state: memory after the frame before.
-        ahead: memory of contact, root and probe after this frame.
+        ahead: memory of contact, root, warp and probe after this frame.
     """
     sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
@@ -169,7 +188,8 @@ def advance(
         centre_ws=state.centre_ws,
         contact=ahead[0],
         root=ahead[1],
-        probe=ahead[2],
+        warp=ahead[2],
+        probe=ahead[3],
         target=target_state,
         lean=lean_state,
         lock=lock_state,
@@ -189,7 +209,7 @@ def pose(
     effector, lean = advanced.effector, advanced.lean
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
     rot_ws, spine_ws, head_ws = lean.rot_ws, lean.spine_ws, lean.head_ws
-    faulty = jnp.zeros_like(rig.present)
+    faulty, turn = jnp.zeros_like(rig.present), sensed.turn
     if faults is not None:
         faulty = faults.legs
         effector = dataclasses.replace(effector, weight=jnp.where(faulty, 0.0, effector.weight))
@@ -197,6 +217,10 @@ def pose(
         level = functools.partial(jnp.where, faults.frame, quat.identity(offset_ws.dtype))
         rot_ws = level(rot_ws)
         spine_ws, head_ws = (None if rot is None else level(rot) for rot in (spine_ws, head_ws))
+        turn = None if turn is None else jnp.where(faults.frame, 0.0, turn)
+    if turn is not None:
+        frame = ik.warp.with_turned_pelvis(frame, turn)
+        inputs = dataclasses.replace(inputs, frame=frame)
     body = body_transform(inputs, rot_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
@@ -209,7 +233,14 @@ def pose(
     spine, head = (
         None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
-    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch, foot.toe)
+    twist = None
+    if turn is not None:
+        pelvis = ik.warp.pelvis_turn(turn)
+        twist = body.turn_rot(quat.conjugate(pelvis.rot))  # about the up of the body as it leans
+        body = body @ pelvis
+    corrections = Corrections(
+        leg.hip, leg.knee, foot.ankle, spine, head, leg.stretch, foot.toe, twist
+    )
     advanced_ws = dataclasses.replace(_in_world(inputs, advanced), state=advanced.state)
     trace = Trace(_in_world(inputs, sensed), advanced_ws)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)

@@ -15,7 +15,8 @@ FRACTIONS = ("weight", "grounded", "slide", "standing", "fraction", "known")
 SIGNED_FRACTIONS = ("side",)
 SIZES = ("foot_speed", "toe_speed", "thigh", "shin", "foot")
 POSITIVE = ("dt", "stride_scale")
-OF_FRAME = ("world_from_model", "velocity_ws", "grounded", "slide", *POSITIVE, "restart")
+OF_FRAME = ("world_from_model", "velocity_ws", "grounded", "slide", *POSITIVE)
+OF_FRAME += ("orientation", "restart")
 PLATFORMS = ("platforms", "platforms_before")
 
 

@@ -71,6 +71,7 @@ class State:
     """m, the origin of all places in this memory; 0 with 64 bits."""
     contact: PyTree
     root: PyTree
+    warp: PyTree
     probe: PyTree
     target: PyTree
     lean: PyTree
@@ -117,6 +118,9 @@ class Corrections:
     leg rule stretches none."""
     toe: Float[Array, "*b legs 4"] | None = None
     """Of the toe joints, local as those of the legs. None if the foot rule does not bend them."""
+    twist: Float[Array, "*b 4"] | None = None
+    """In model space, before that of the spine: the joints of the spine share it evenly, each
+    turning about itself with all joints above it. None where `Frame.orientation` is."""
 
 
 @struct

@@ -1,14 +1,22 @@
-"""Strides scaled for a character that is faster or slower than its animation, before the probe."""
+"""Strides scaled and turned for a character that moves otherwise than its animation."""
 
+import dataclasses
+import math
+
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, Rule, ratio
-from jaxik.world.frame import heading
+from jaxik.maths import quat, vec
+from jaxik.maths.parameter_tree import Leaf, Rule, angle, duration, ratio
+from jaxik.maths.smoothing import fraction_of_half_life, lerp
+from jaxik.world.frame import UP, Frame, counted, heading
+from jaxik.world.skeleton import Rig, Transform
 
-from .inputs import Inputs
+from .inputs import Inputs, Moment
 
 SCALE_BAND = 0.02
+ANGLE_BAND = 0.035  # rad, 2 degrees
+RIGHT_ANGLE = 0.5 * math.pi
 
 
 class StrideWarp(Rule):
@@ -25,13 +33,79 @@ class StrideWarp(Rule):
     Engine: steps keep their width, but feet skate as far as the root sways or turns. Locomotion
     systems after Johansen (2009) adapt strides in this way too. Pelvis and heels then follow as
     far as longer strides need them to.
+
+    A character that moves in another direction than its animation (`Frame.orientation`) has its
+    feet turned about the root's up by that angle, up to `max_angle`, the pelvis by
+    `pelvis_share` of it, and the spine back by as much, which leaves the shoulders as animated:
+    Unreal's *Orientation Warping*, whose *Distributed Bone Orientation Alpha* is this share. Beyond
+    a right angle the turn falls again, to none for a character that goes backward. It follows with
+    `half_life`, also in the air and without foot IK, where it is none.
     """
 
     min_scale: Leaf = ratio(0.4, 0, 1, "Shortest strides, as a part of the animated ones.")
     max_scale: Leaf = ratio(1.5, 1, 2.5, "Longest strides, as a multiple of the animated ones.")
     width: Leaf = ratio(1, 0, 1, "How much the width of steps is scaled with their length.")
 
-    def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
+    max_angle: Leaf = angle(
+        1.5, 0, RIGHT_ANGLE, "Largest angle by which the feet are turned.", per_leg=False
+    )
+    pelvis_share: Leaf = ratio(
+        0.5, 0, 1, "Part of the feet's turn that the pelvis makes.", per_leg=False
+    )
+    half_life: Leaf = duration(
+        0.1,
+        0.002,
+        0.5,
+        "Time in which the feet turn half of their way.",
+        scale="log",
+        per_leg=False,
+    )
+
+    def init(self, rig: Rig) -> Float[Array, ""]:
+        """Memory before the first frame: the feet's turn, rad."""
+        return jnp.zeros((), rig.side.dtype)
+
+    def sense(self, inputs: Inputs) -> Float[Array, ""] | None:
+        """The turn that the feet are to have, rad; None, which costs nothing, where none does."""
+        frame = inputs.frame
+        if frame.orientation is None:
+            return None
+        turn = frame.orientation
+        turn -= 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
+        turn = jnp.where(turn > RIGHT_ANGLE, jnp.pi - turn, turn)
+        turn = jnp.where(turn < -RIGHT_ANGLE, -jnp.pi - turn, turn)
+        turn = inputs.gate.clip(turn, -self.max_angle, self.max_angle, band=ANGLE_BAND)
+        weight = vec.sum_last(jnp.where(inputs.rig.present, frame.weight, 0.0))
+        return turn * frame.grounded * counted(weight)
+
+    def advance(
+        self, now: Moment, goal: Float[Array, ""] | None, state: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+        """Memory after this frame, and the feet's turn, rad."""
+        if goal is None:
+            return state, None
+        fraction = now.progress(fraction_of_half_life(self.half_life, now.dt))
+        turn = lerp(state, goal, fraction)
+        return turn, turn
+
+    def pelvis_turn(self, turn: Float[Array, ""]) -> Transform:
+        """The pelvis' motion in model space, where the feet turn by `turn`, rad."""
+        return _about_up(self.pelvis_share * turn)
+
+    def with_turned_pelvis(self, frame: Frame, turn: Float[Array, ""]) -> Frame:
+        """The single frame with its legs on the turned pelvis."""
+        legs = frame.weight.shape[-1]
+        pose = frame.pose.transformed(self.pelvis_turn(turn).repeat(legs))
+        return dataclasses.replace(frame, pose=pose)
+
+    def with_turned_feet(self, frame: Frame, bearing: Array, turn: Float[Array, ""]) -> Frame:
+        """The single frame on its turned pelvis, with feet that bear turned all the way."""
+        rest = _about_up((1.0 - self.pelvis_share) * turn * bearing * jnp.ones_like(frame.weight))
+        pose = frame.pose
+        pose = dataclasses.replace(pose, ankle=rest @ pose.ankle, toe=rest @ pose.toe)
+        return dataclasses.replace(frame, pose=pose)
+
+    def offset(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
         """How far each foot moves, m, world space; None, which costs nothing, where none does."""
         frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
         if frame.stride_scale is None:
@@ -50,3 +124,9 @@ class StrideWarp(Rule):
         across = vec.reject(offset, way)
         scaled = offset - vec.scale(across, 1.0 - self.width)
         return vec.scale(scaled, scale - 1.0)
+
+
+def _about_up(turn: Float[Array, "*b"]) -> Transform:
+    """Turns about the root's up, model space, by these angles, rad."""
+    up = vec.constant(UP, turn)
+    return Transform(jnp.zeros((*turn.shape, 3), turn.dtype), quat.from_axis_angle(up, turn))

@@ -79,6 +79,9 @@ class Frame:
     stride_scale: Float[Array, "*b"] | None = None
     """Speed of the character over that of its animation, by which its strides are to be scaled.
     None leaves them as animated and costs nothing."""
+    orientation: Float[Array, "*b"] | None = None
+    """rad, from the direction in which the animation moves to that in which the character does,
+    positive to its left. The lower body is turned by it. None turns nothing and costs nothing."""
     restart: Bool[Array, "*b"] | None = None
     """True where nothing leads here from the previous frame, as after a teleport: memory starts
     anew. Speeds and strides are then those after it. None never restarts and costs nothing."""
@@ -246,7 +249,10 @@ class Sensed:
     foothold: Foothold
     slope: Slope
     warp_ws: Float[Array, "legs 3"] | None = None
-    """m, by which scaled strides move ankles and balls, which have moved already; None for none."""
+    """m, by which scaled and turned strides move the ankles from the animation on the turned
+    pelvis; they have moved already. None for none."""
+    turn: Float[Array, ""] | None = None
+    """rad, by which the feet are turned about the root's up; None for not at all."""
 
     @property
     def bearing(self) -> Float[Array, "*legs"]:
@@ -265,7 +271,7 @@ class Sensed:
 
     @property
     def unscaled_ankle_ws(self) -> Float[Array, "legs 3"]:
-        """m, the animated ankles before strides are scaled."""
+        """m, the animated ankles before strides are scaled and turned."""
         return self.ankle_ws if self.warp_ws is None else self.ankle_ws - self.warp_ws
 
     @property

@@ -380,7 +380,11 @@ def test_the_reading_of_a_clip_is_announced(monkeypatch):
 OF_CLIPS = {"--scale": ("1e-9", "1e6"), "--sole": ("0", "10")}
 OF_TERRAINS = {"--terrain-scale": ("1e-9", "1e6"), "--terrain-cell": ("0.001", "1e4")}
 OF_TERRAINS |= {"--terrain-offset": ("-1e6", "1e6")}
-OF_ANIMATIONS = {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100")} | OF_CLIPS | OF_TERRAINS
+OF_ANIMATIONS = (
+    {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100"), "--direction": ("-90", "90")}
+    | OF_CLIPS
+    | OF_TERRAINS
+)
 OF_PAGES = {"--port": ("0", "65535")}
 OF_RECORDS = {"--tick-hz": ("1", "1000")}
 RANGES = {  # by command, with other words that it needs

@@ -131,6 +131,31 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
     np.testing.assert_array_equal(legs_only.positions_ws, plain.positions_ws[:, :9])
 
 
+def test_the_joints_of_the_spine_share_a_twist_up_to_where_the_arms_branch_off(clip, result):
+    joints = [("spine", 0, [0.0, 0.1, 0.0]), ("chest", 9, [0.0, 0.2, 0.1])]
+    joints += [("arm", 10, [0.2, 0.0, 0.0]), ("neck", 10, [0.0, 0.1, 0.0])]
+    taller = with_joints(clip, [*joints, ("head", 12, [0.0, 0.1, 0.0])])
+    twist = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.8, clip.frame_count), [0.0, 1.0, 0.1]))
+    corrections = dataclasses.replace(
+        result.corrections, twist=jnp.asarray(twist.as_quat(scalar_first=True))
+    )
+    plain = clip_frames.clip_from_result(taller, result)
+    twisted = dataclasses.replace(result, corrections=corrections)
+    solved = clip_frames.clip_from_result(taller, twisted)
+    root = rotation(clip.world_from_model().rot)
+    for joint, share in ((0, 0.0), (9, 0.5), (10, 1.0), (11, 1.0), (12, 1.0), (13, 1.0)):
+        turn = (
+            rotation(solved.rotations_ws[:, joint]) * rotation(plain.rotations_ws[:, joint]).inv()
+        )
+        expected = root * Rotation.from_rotvec(share * twist.as_rotvec()) * root.inv()
+        np.testing.assert_allclose((turn * expected.inv()).magnitude(), 0.0, atol=1e-9)
+    for low, high in ((0, 9), (9, 10), (10, 11), (12, 13)):
+        bones = (c.positions_ws[:, high] - c.positions_ws[:, low] for c in (plain, solved))
+        turns = (rotation(c.rotations_ws[:, low]).inv() for c in (plain, solved))
+        before, after = (turn.apply(bone) for turn, bone in zip(turns, bones, strict=True))
+        np.testing.assert_allclose(after, before, atol=1e-9)
+
+
 def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(clip):
     rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
     frames, flat = (clip_frames.frames_from_clip(clip, rise=height) for height in (rise, None))

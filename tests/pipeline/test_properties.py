@@ -61,6 +61,8 @@ class Row(NamedTuple):
             frames = frames.with_platforms(Transform(jnp.zeros((FRAMES, 1, 3)), rot))
         ground = clips.to_terrain(dataclasses.replace(self.ground, platform=0))
         gate = Either(jnp.asarray(self.softness > 0.0), Smooth(self.softness or 1.0))
+        if frames.orientation is None:
+            frames = dataclasses.replace(frames, orientation=jnp.zeros_like(frames.dt))
         ik = parameter_tree.with_option(to_ik(self.values), "foot.bend_toes", True)
         return ik, self.rig, ground, frames, gate
 
@@ -73,6 +75,7 @@ def wander() -> jaxik.Frame:
     angle = 0.1 * np.sin(2.0 * time)
     pos = np.stack([0.05 * time, 0.0 * time, 0.03 * np.sin(time)], axis=-1)
     rot = np.stack([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=-1)
+    frames = dataclasses.replace(frames, orientation=0.5 * jnp.sin(3.0 * time))
     return frames.with_platforms(Transform(jnp.asarray(pos)[:, None], jnp.asarray(rot)[:, None]))
 
 
@@ -143,7 +146,8 @@ def mirrored_row(values: dict[str, Any]) -> Row:
     sides = [(point * FLIP, normal * FLIP) for point, normal in DRIFTING.planes]
     ground = dataclasses.replace(DRIFTING, planes=sides)
     twist = {"leg.twist": -parameter_tree.get(to_ik(values), "leg.twist")}
-    return Row(ground, mirrored(wander()), values | twist, rig)
+    frames = dataclasses.replace(mirrored(wander()), orientation=-wander().orientation)
+    return Row(ground, frames, values | twist, rig)
 
 
 def swapped(tree: Any, axis: int = 1) -> Any:
@@ -327,6 +331,29 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     # A leg of weight 0.9 never reaches its target exactly.
     assert reached.any() == (name == "adult") and not reached.all()
     assert gap[reached].max(initial=0.0) < EXACT < gap[~reached].min()
+
+
+def test_the_spine_turns_back_what_the_pelvis_turns_and_the_feet_turn_further():
+    result, frames = result_of("adult"), wander()
+    turn, root = np.asarray(result.trace.sensed.turn), frames.world_from_model.rot
+    assert np.abs(turn).max() > 0.2
+    sin = np.sin(0.25 * turn)
+    np.testing.assert_allclose(np.asarray(result.corrections.twist)[:, 2], -sin, atol=0.02)
+    # With the lean alone, the trunk keeps the heading of the root.
+    trunk = quat.multiply(result.corrections.twist, result.body.rot)
+    lean = result.trace.advanced.lean.rot_ws
+    lean = quat.multiply(quat.conjugate(root), quat.multiply(lean, root))
+    assert_same_rot(trunk, lean, EXACT)
+    sensed = result.trace.sensed
+    forward = np.asarray(quat.rotate(quat.conjugate(root)[:, None], sensed.ahead_ws))
+    animated = np.asarray(
+        quat.rotate(
+            quat.multiply(frames.pose.ankle.rot, RIG.ankle_from_foot), jnp.array([0.0, 0.0, 1.0])
+        )
+    )
+    yaw = [np.arctan2(x[..., 0], x[..., 2]) for x in (forward, animated)]
+    between = (yaw[0] - yaw[1] - turn[:, None] + np.pi) % (2.0 * np.pi) - np.pi
+    np.testing.assert_allclose(between, 0.0, atol=1e-6)
 
 
 def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz():

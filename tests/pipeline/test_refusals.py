@@ -46,9 +46,14 @@ def assert_right_shapes(ik: jaxik.FootIK) -> None:
     result = jax.eval_shape(jaxik.run, ik, RIG, GROUND, CLIP)
     places = [leaf.shape for leaf in jax.tree.leaves((result.pose, result.body))]
     assert places == [(FRAMES, LEGS, 3), (FRAMES, LEGS, 4)] * 4 + [(FRAMES, 3), (FRAMES, 4)]
-    turns = [(FRAMES, LEGS, 4)] * 3 + [(FRAMES, 4)] * 2
-    corrections = [leaf.shape for leaf in jax.tree.leaves(result.corrections)]
-    assert corrections == turns[: len(corrections)]
+    of_legs, of_body = (FRAMES, LEGS, 4), (FRAMES, 4)
+    wanted = dict.fromkeys(("hip", "knee", "ankle", "toe"), of_legs) | {"stretch": (FRAMES, LEGS)}
+    wanted |= dict.fromkeys(("spine", "head", "twist"), of_body)
+    corrections = {
+        name: leaf.shape for name, leaf in vars(result.corrections).items() if leaf is not None
+    }
+    assert corrections == {name: wanted[name] for name in corrections}
+    assert {"hip", "knee", "ankle"} <= corrections.keys()
     assert result.reached.shape == result.aimed.shape == (FRAMES, LEGS)
 
 
@@ -60,6 +65,7 @@ def with_one_a_leg(ik: jaxik.FootIK, *names: str) -> jaxik.FootIK:
 
 BODY = ("root.", "lean.", "pelvis.")
 ONE_FOR_ALL = ("lock.hold_ball", "separation.distance", "effector.latch")
+ONE_FOR_ALL += ("warp.max_angle", "warp.pelvis_share", "warp.half_life")
 PER_LEG_IN_THE_PELVIS = (
     "pelvis.min_length", "pelvis.max_length", "pelvis.extension", "pelvis.min_extension",
 )  # fmt: skip

@@ -87,7 +87,8 @@ RootTarget: adjust m 0 -0.1 0.1
 SlopeTarget: min_ankle_height m -0.3 -1 0.5; max_ankle_height m 0.55 0 1.5;
   foot_height m 0.08 0 0.2; max_slope rad 1.047198 0.1 1.5; max_penetration m inf 0 0.2
 SoleTarget: foot_height m 0.12 0 0.2; max_slope rad 1.5 0.1 1.5
-StrideWarp: min_scale 1 0.4 0 1; max_scale 1 1.5 1 2.5; width 1 1 0 1
+StrideWarp: min_scale 1 0.4 0 1; max_scale 1 1.5 1 2.5; width 1 1 0 1;
+  max_angle rad 1.5 0 1.570796; pelvis_share 1 0.5 0 1; half_life s 0.1 0.002 0.5
 """
 
 # Of each preset, `!` where it is faithful to the original: the rules in the order of the stages,

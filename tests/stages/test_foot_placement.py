@@ -1,18 +1,22 @@
-"""What Unreal's Foot Placement and Mecanim have besides: legs that stretch, toes that bend.
+"""What Unreal and Mecanim have besides: legs that stretch, toes that bend, feet that are turned.
 
 Each against geometry or NumPy, its limits, precision and derivatives.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fitting.runtime.precision import with_floats
 from jaxik.maths import quat
 from jaxik.maths.gate import HARD
 from jaxik.stages.foot import KeepFoot, SolvedFoot
-from jaxik.stages.inputs import Inputs
+from jaxik.stages.inputs import Inputs, Moment
 from jaxik.stages.leg import LegGoal, TwoBone
+from jaxik.stages.warp import StrideWarp
 from jaxik.world import terrain
 from jaxik.world.frame import Contact, Frame, GroundHits, Rays, Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
@@ -205,3 +209,92 @@ def test_bent_toes_have_right_and_finite_derivatives_in_both_precisions():
     for rounded, exact in zip(bend(*single), bend(KeepFoot(), *arrays, jnp.ones(())), strict=True):
         assert rounded.dtype == jnp.float32
         np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-5)
+
+
+# Feet that are turned to where the character goes.
+
+WARP = {"max_angle": 1.2, "pelvis_share": 0.3, "half_life": 0.2}
+DT = 0.05  # s
+
+
+def turned(rule, orientation, grounded, weight, points, bearing, gate=HARD):
+    """The turns of frames, rad, and hips and ankles (frames legs 3), m, of legs at `points`."""
+    rig = fragment(Rig, present=jnp.array([True, True, False]), side=jnp.zeros(3, points.dtype))
+
+    def frame(carry, inputs):
+        state, started = carry
+        orientation, grounded, weight, points, bearing = inputs
+        still = 0.0 * points[:, :1] + quat.identity(points.dtype)
+        joint = Transform(points, still)
+        pose = LegPose(joint, joint, joint, joint)
+        frame = Frame(
+            **dict.fromkeys(REQUIRED)
+            | {"weight": weight, "grounded": grounded, "orientation": orientation, "pose": pose}
+        )
+        goal = rule.sense(fragment(Inputs, frame=frame, rig=rig, gate=gate))
+        state, turn = rule.advance(
+            Moment(jnp.asarray(DT, points.dtype), started, gate), goal, state
+        )
+        carried = rule.with_turned_pelvis(frame, turn)
+        feet = rule.with_turned_feet(carried, bearing, turn)
+        places = feet.pose.hip.pos, feet.pose.ankle.pos, feet.pose.toe.rot
+        return (state, jnp.ones_like(started)), (turn, *places)
+
+    start = rule.init(rig), jnp.zeros((), bool)
+    return jax.lax.scan(frame, start, (orientation, grounded, weight, points, bearing))[1]
+
+
+REQUIRED = [
+    field.name for field in dataclasses.fields(Frame) if field.default is dataclasses.MISSING
+]
+turn_all = jax.jit(turned)
+
+
+def directions(frames: int = 40) -> tuple[np.ndarray, ...]:
+    """Directions all round, in the air at times, with legs of all weights and bearings."""
+    rng = np.random.default_rng(2)
+    grounded = (np.arange(frames) % 9 > 0).astype(float)
+    weight = rng.uniform(0.0, 0.1, (frames, 3)) * (np.arange(frames) % 3 > 0)[:, None]
+    points = rng.normal(0.0, 0.5, (frames, 3, 3))
+    return np.linspace(-7.0, 7.0, frames), grounded, weight, points, rng.uniform(size=(frames, 3))
+
+
+def test_feet_and_pelvis_are_turned_as_in_numpy():
+    inputs = [jnp.asarray(x) for x in directions()]
+    turns, hips, ankles, rots = map(np.asarray, turn_all(StrideWarp(**WARP), *inputs))
+    expected, memory = [], None
+    for orientation, grounded, weight, points, bearing in zip(*directions(), strict=True):
+        sine, cosine = np.sin(orientation), np.cos(orientation)
+        aside = np.arctan2(sine, abs(cosine))  # from the line of motion, whichever way along it
+        aside = np.clip(aside, -1.2, 1.2) * grounded * min(1.0, weight[:2].sum() / 0.1)
+        memory = aside if memory is None else memory + (aside - memory) * (1.0 - 2.0 ** (-DT / 0.2))
+        pelvis = Rotation.from_rotvec([0.0, 0.3 * memory, 0.0])
+        rest = Rotation.from_rotvec(np.outer(0.7 * memory * bearing, [0.0, 1.0, 0.0]))
+        expected.append(
+            (memory, pelvis.apply(points), (rest * pelvis).apply(points), rest * pelvis)
+        )
+    for actual, wanted in zip((turns, hips, ankles), zip(*expected, strict=True), strict=False):
+        np.testing.assert_allclose(actual, np.stack(wanted), rtol=0, atol=1e-12)
+    for actual, (*_, rot) in zip(rots, expected, strict=True):
+        apart = (rot.inv() * Rotation.from_quat(actual, scalar_first=True)).magnitude()
+        np.testing.assert_allclose(apart, 0.0, atol=1e-9)
+    assert np.abs(turns).max() > 0.4
+    assert StrideWarp().sense(fragment(Inputs, frame=fragment(Frame, orientation=None))) is None
+
+    single = with_floats((StrideWarp(**WARP), *inputs), np.dtype(np.float32))
+    for rounded, exact in zip(turn_all(*single), (turns, hips, ankles, rots), strict=True):
+        assert rounded.dtype == jnp.float32
+        np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-5)
+
+
+def test_a_turn_has_right_and_finite_derivatives_all_round():
+    _, grounded, weight, points, bearing = (x[:3] for x in directions())
+
+    def feet(values, orientation, blurred):
+        rest = (jnp.asarray(x) for x in (1.0 + 0.0 * grounded, weight, points, bearing))
+        return turned(StrideWarp(**values), orientation, *rest, gate=Either(blurred > 0.5))[:3]
+
+    for blurred in (0.0, 1.0):
+        assert_gradients_match(feet, WARP, np.array([0.3, 2.5, -1.0]), blurred)
+        finite_jacobian(feet, WARP, np.array([0.0, np.pi, -np.pi / 2]), blurred)
+        finite_jacobian(feet, WARP, np.array([0.0, 0.0, 1.2]), blurred)

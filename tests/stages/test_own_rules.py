@@ -329,7 +329,7 @@ def offsets(rule, toes_ms, velocity_ws, scale, root, gate=HARD):
         Frame, world_from_model=root, pose=pose, velocity_ws=velocity_ws, stride_scale=scale
     )
     ground = fragment(Terrain, up_ws=jnp.asarray([0.0, 1.0, 0.0], toes_ms.dtype))
-    return rule.sense(fragment(Inputs, frame=frame, terrain=ground, gate=gate))
+    return rule.offset(fragment(Inputs, frame=frame, terrain=ground, gate=gate))
 
 
 offsets_of_all = jax.jit(jax.vmap(offsets, in_axes=(None, 0, 0, 0, 0)))
@@ -406,6 +406,22 @@ def test_feet_of_a_faster_or_slower_walk_do_not_skate():
         # Longer strides need a lower pelvis; shorter ones do not.
         lowered = np.asarray(result.body.pos[:, 1]).min()
         assert (lowered < -0.01) == (speed > 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("direction", [0.5, -1.2])
+def test_feet_of_a_walk_in_another_direction_do_not_skate(direction):
+    clip = walker.walk(3.0, 30.0)
+    stance = clip.stance_labels()
+    played, slides = edit.in_direction(clip, direction), []
+    for orientation in (None, direction):
+        frames = frames_from_clip(played, orientation=orientation)
+        result = jaxik.run(jaxik.presets.stride(), clip.rig, terrain.plane(), frames)
+        solved = clip_from_result(played, result)
+        steps = np.linalg.norm(np.diff(solved.joints_ws(3)[..., [0, 2]], axis=0), axis=-1)
+        stances = [(leg, *run) for leg in range(2) for run in contacts.runs(stance[:, leg])]
+        slides.append(np.median([steps[a:b, leg].sum() for leg, a, b in stances]))
+    assert slides[0] > 0.10 and slides[1] < 0.005, "m in each stance"
 
 
 # All of them.
