@@ -32,7 +32,8 @@ class LowestPelvis(AbstractPelvis):
     goal is 0. Without a limit and with gains of 1 this is ozz's pelvis correction.
 
     Down a slope a walker stands on the foot behind, which is higher, and swings the other towards
-    lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then.
+    lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then. It
+    also stays where it is while no foot stands.
 
     A squatter's leg cannot fold much further. With `min_extension` above 0 the body rises with a
     standing foot that would fold it more, unless the animation does.
@@ -77,8 +78,9 @@ class LowestPelvis(AbstractPelvis):
         unfolded = jnp.where(least > lowest, smoothing.lerp(lowest, least, weight), lowest)
         lowest = gate.maximum(unfolded, band=HEIGHT_BAND)
         standing = gate.maximum(weight, band=0.1)
-        goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
-        goal = jnp.where(self.enabled, goal, 0.0)
+        resting = jnp.where(self.wait_to_rise, state.height, 0.0)
+        lowest = gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, smoothing.lerp(resting, lowest, standing), 0.0)
         fraction = smoothing.lerp(
             smoothing.fraction_of_gain(self.off_gain, now.dt, self.tick_hz),
             smoothing.fraction_of_gain(self.on_gain, now.dt, self.tick_hz),

@@ -312,7 +312,9 @@ def follow_by_gain(
     parameters: Parameters, low: float, contact: float, before: float | None, dt: float
 ) -> float:
     """Height of the body after a frame, m, of which feet with a contact want `low`."""
-    goal = contact * clip(low, -parameters["pelvis.limit"], parameters["pelvis.limit"])
+    resting = before if before and parameters["pelvis.wait_to_rise"] else 0.0
+    low = clip(low, -parameters["pelvis.limit"], parameters["pelvis.limit"])
+    goal = lerp(resting, low, contact)
     if before is None:
         return goal
     off, on = (
