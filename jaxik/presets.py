@@ -234,7 +234,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         lean=SpineLean(pelvis_rate=body.pitch_rate(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
-        pelvis=ReachPelvis(rise_half_life=0.03, fall_half_life=0.03, spring=True),
+        pelvis=ReachPelvis(rise_half_life=0.08, fall_half_life=0.03, spring=True),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
         foot=PitchRollFoot(**SLOPES),

@@ -131,7 +131,7 @@ mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no
 stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
-  ReachPelvis rise_half_life=0.03 fall_half_life=0.03 spring=yes; HeelEffector;
+  ReachPelvis rise_half_life=0.08 fall_half_life=0.03 spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
   PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 """

@@ -18,7 +18,7 @@ from reference.terrain import ALL_LAYERS
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
     "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.025, shift=0.15)
-    | named("pelvis", rise_half_life=0.03, fall_half_life=0.03, spring=True),
+    | named("pelvis", rise_half_life=0.08, fall_half_life=0.03, spring=True),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
 }
