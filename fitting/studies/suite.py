@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.clips.assemble import JointMotion, clip_from_joints
@@ -41,9 +42,9 @@ from fitting.report.formatting import Table, listed, meanings
 from fitting.report.style import BEFORE, STAGES
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
-from fitting.synthetic import actions, walker
+from fitting.synthetic import actions, footsteps, walker
 from fitting.synthetic.footsteps import smoothstep
-from jaxik.world.terrain import Terrain, heightfield
+from jaxik.world.terrain import Terrain, combine, heightfield
 
 from . import comparison
 from .animations import Animation
@@ -57,7 +58,13 @@ HILL_HEIGHT, HILL_LENGTH = 2.0, 7.0  # m; its steepest part has 24 degrees
 RISE, TREAD, STEPS = 0.15, 0.30, 8  # m, m and count, of stairs
 CURB, KERBSIDE = 0.15, 2.0  # m, height and width of a traffic island
 RUBBLE, RUBBLE_CELL = 0.06, 0.4  # m, height over and under the floor, and spacing of its corners
-BLOCK = 0.12  # m, under one foot
+FLIGHTS, FLIGHT, LEAN = (1.0, 3.05, 5.2), 4, 0.02  # m along the path, steps, and m of each riser
+BLOCK, DIP = 0.12, 0.20  # m, under one foot
+LEDGE = 0.15  # m, to the ground under the toes
+TOES = actions.BALL_AHEAD + 0.02  # m along the path, from which there is nothing under them
+PLANKS, PLANK = 8, 0.015  # in a stride, and m along the path, where a gap begins below an ankle
+GAP, HOLLOW = 0.03, 0.30  # m, between planks and below them
+STOREY = 0.34  # m; a root is moved for a floor that is much higher
 PLATEAU = 0.5  # m
 
 HeightAt: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray | float]
@@ -70,6 +77,7 @@ STRAIGHT = walker.WalkStyle(bend=0.0, knees=1.0)
 ADULT, CHILD, GIANT = 1.8, 1.1, 3.0  # m, tall
 LEAP = 8.0  # m, of a teleport
 LIFT = 6.0  # m, of an elevator
+YAW, PUSH = np.radians(45.0), 0.2  # rad/s and m/s, of an idle whose body does not step
 TRAIN_SPEED, BRAKING = 20.0, 2.0  # m/s and s
 
 Animate = Callable[[float], Clip]
@@ -105,6 +113,30 @@ def sampled(height: HeightAt) -> Terrain:
     return heightfield(heights, SPACING, origin=(-HALF_WIDTH, 0.0, -BEHIND))
 
 
+class Cover(NamedTuple):
+    """A level surface over the ground: a ceiling, or the seat of a bench."""
+
+    height: float
+    """Metres."""
+    begin: float
+    """m along the path."""
+    end: float
+    """m along the path."""
+    aside: float = 0.0
+    """m, of its middle from the path."""
+
+    def terrain(self) -> Terrain:
+        """It alone, in JAX's default precision."""
+        size = 2.0 * HALF_WIDTH, self.end - self.begin
+        corner = self.aside - HALF_WIDTH, self.height, self.begin
+        return heightfield(np.zeros((2, 2)), size, origin=corner)
+
+
+CEILING = Cover(2.4, 1.0, AHEAD)
+SEAT = Cover(0.45, -0.65, -0.20)
+NO_COVER = Cover(0.0, 0.0, 1.0, aside=1e3)  # far away, so that all grounds have one structure
+
+
 def flat(x: np.ndarray, z: np.ndarray) -> float:
     """A level floor."""
     return 0.0
@@ -123,6 +155,17 @@ def stairs_up(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 def stairs_down(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Eight steps down, from 1 m ahead."""
     return -stairs_up(x, z)
+
+
+def leaning_stairs_up(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Three flights, each met at another place of a stride, whose risers lean by 2 cm."""
+    edges = [start + TREAD * step for start in FLIGHTS for step in range(FLIGHT)]
+    return RISE * np.sum([np.clip((z - edge) / LEAN, 0.0, 1.0) for edge in edges], axis=0)
+
+
+def leaning_stairs_down(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The same down."""
+    return -leaning_stairs_up(x, z)
 
 
 def slope_along(x: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -159,6 +202,27 @@ def block(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return BLOCK * (x > 0.0)
 
 
+def dip(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """A dip under the right foot."""
+    return -DIP * (x < 0.0)
+
+
+def ledge(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """A ledge over which the toes of an idle stand."""
+    return -LEDGE * (z > TOES)
+
+
+def planks(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Planks with gaps over a hollow; a walk without variation has its balls between two gaps."""
+    pitch = footsteps.STRIDE / PLANKS
+    return -HOLLOW * (np.mod(z - PLANK, pitch) < GAP)
+
+
+def higher_floor(x: np.ndarray, z: np.ndarray) -> float:
+    """A level floor higher than that of the animation, but still left to foot IK."""
+    return STOREY
+
+
 def plateau(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """A plateau of half a metre, which begins 8 m ahead."""
     return PLATEAU * smoothstep((z - 4.0) / 4.0)
@@ -171,6 +235,7 @@ class Situation:
     name: str
     animate: Animate
     height: HeightAt
+    cover: Cover = NO_COVER
     quick: bool = False
     """Whether it belongs to the short form of the suite."""
     vehicle: Vehicle | None = None
@@ -178,7 +243,7 @@ class Situation:
 
     def animation(self, seconds: float) -> Animation:
         """The animation, with its root where the commands put it."""
-        terrain = sampled(self.height)
+        terrain = combine(sampled(self.height), self.cover.terrain())
         clip, root = place_root(self.animate(seconds), terrain)
         times = np.arange(clip.frame_count) / clip.fps
         carried = None if self.vehicle is None else self.vehicle(times)
@@ -222,6 +287,26 @@ def teleport(seconds: float) -> Clip:
     return replace(clip.with_motion(positions, clip.rotations_ws), source="teleport")
 
 
+def plank_walk(seconds: float) -> Clip:
+    """A walk whose steps are all alike."""
+    return walker.walk(seconds, FPS, style=walker.WalkStyle(bend=0.0, variation=0.0, knees=1.0))
+
+
+def carried_idle(seconds: float) -> Clip:
+    """An idle that turns, and then is pushed ahead, without a step."""
+    clip = actions.idle(seconds, FPS)
+    time = np.arange(clip.frame_count) / FPS
+    yaw = YAW * np.minimum(time, seconds / 2)
+    turn = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
+    pushed = PUSH * np.maximum(time - seconds / 2, 0.0)
+    positions, rotations = clip.positions_ws.copy(), clip.rotations_ws.copy()
+    for joint in range(len(clip.joint_names)):
+        turned = turn * Rotation.from_quat(rotations[:, joint], scalar_first=True)
+        positions[:, joint] = turn.apply(positions[:, joint]) + pushed[:, None] * [0.0, 0.0, 1.0]
+        rotations[:, joint] = turned.as_quat(scalar_first=True)
+    return replace(clip.with_motion(positions, rotations), source="carried idle")
+
+
 def elevator(times: np.ndarray) -> np.ndarray:
     """Up by 6 m, with a start and a stop."""
     return LIFT * smoothstep(times / times[-1])[:, None] * [0.0, 1.0, 0.0]
@@ -240,19 +325,97 @@ SITUATIONS = (
     Situation("hill", walk, hill, quick=True),
     Situation("stairs up", walk, stairs_up, quick=True),
     Situation("stairs down", walk, stairs_down),
+    Situation("leaning stairs up", walk, leaning_stairs_up),
+    Situation("leaning stairs down", walk, leaning_stairs_down, quick=True),
     Situation("slope along", walk, slope_along),
     Situation("slope across", walk, slope_across, quick=True),
     Situation("rubble", walk, rubble, quick=True),
     Situation("curb", walk, curb),
+    Situation("planks", plank_walk, planks, quick=True),
+    Situation("room", walk, flat, cover=CEILING),
+    Situation("higher floor", walk, higher_floor),
     Situation("elevator", actions.turn, flat, vehicle=elevator),
     Situation("train", walk, flat, vehicle=train),
     Situation("jump", actions.jump, rubble, quick=True),
     Situation("crouch", actions.crouch, block, quick=True),
+    Situation("squat on a block", actions.squat, block),
+    Situation("squat on a slope", actions.squat, slope_along),
+    Situation("bench", actions.sit, flat, cover=SEAT),
+    Situation("carried idle", carried_idle, flat),
+    Situation("dip", actions.idle, dip),
+    Situation("ledge", actions.idle, ledge),
     Situation("turn in place", actions.turn, slope_along),
     Situation("giant", walk_of(GIANT), rubble),
     Situation("child", walk_of(CHILD), rubble),
     Situation("teleport", teleport, plateau),
 )
+
+
+class Limitation(NamedTuple):
+    """What a preset cannot do, with its reason."""
+
+    preset: str
+    situations: str
+    """Names, separated by commas; all, if empty."""
+    measures: str
+    """Names, separated by spaces."""
+    reason: str
+
+
+STAIRS = "stairs up, stairs down, leaning stairs up, leaning stairs down"
+LIMITATIONS = (
+    Limitation(
+        "record", f"{STAIRS}, curb", "penetration contact pop pelvis_jerk reached",
+        "its original casts one ray under each foot, which meets a step once it is over it",
+    ),
+    Limitation(
+        "record", "hill, slope along", "penetration contact slide pelvis_jerk reached",
+        "its original lowers the body to the lowest standing foot, whatever the legs reach",
+    ),
+    Limitation(
+        "record", "carried idle", "foot_skating",
+        "its original locks feet that nobody steps with; they go back once they are let go",
+    ),
+    Limitation(
+        "ozz", f"{STAIRS}, curb, planks", "penetration contact reached",
+        "its original has each foot on the ground below it, also in mid-swing before a step",
+    ),
+    Limitation(
+        "ozz", "", "slide foot_skating pop pelvis_jerk",
+        "its original lays all soles flat on the ground, at once and without memory",
+    ),
+    Limitation(
+        "unreal", "", "penetration contact pop pelvis_jerk reached",
+        "its original works only while the character stands, and its latch may freeze the pelvis",
+    ),
+    Limitation(
+        "mec", "planks", "penetration contact slide pop pelvis_jerk reached",
+        "the rays of its original fall through gaps",
+    ),
+    Limitation(
+        "mec", "", "penetration contact pop pelvis_jerk reached",
+        "its original leaves feet as animated unless they are low and slow, and the body with them",
+    ),
+    Limitation(
+        "mec", "carried idle", "foot_skating",
+        "its original plants feet that nobody steps with; they go back once they are let go",
+    ),
+    Limitation(
+        "stride", f"{STAIRS}, hill, slope along", "pop pelvis_jerk",
+        "its pelvis sinks as fast as a trailing leg gets too long",
+    ),
+)  # fmt: skip
+"""What the presets miss with their defaults."""
+
+
+def reason_of(system: str, situation: str, measure: str) -> str | None:
+    """Why a preset misses a bound in a situation; None where that is not known."""
+    for limitation in LIMITATIONS:
+        names = [name.strip() for name in limitation.situations.split(",") if name]
+        there = not names or situation in names
+        if system == limitation.preset and there and measure in limitation.measures.split():
+            return limitation.reason
+    return None
 
 
 def choose(only: str | None = None, *, quick: bool = False) -> Plan:
@@ -357,13 +520,19 @@ def missed(suite: Suite) -> list[str]:
 
 
 def misses(scene: Scene, system: str) -> list[str]:
-    """What is beyond its bound, a phrase each, and the likely cause of feet off the ground."""
+    """What is beyond its bound with its reason, a phrase each, and why feet are off the ground."""
     compared = scene.comparison
     if system in compared.failures:
         return [f"no motion: {compared.failures[system]}"]
     cause = compared.causes[system]
     known = [] if cause is None or cause.kind == "unknown" else [f"likely cause: {cause.kind}"]
-    return [*(bounded.words for bounded in scene.beyond(system)), *known]
+    beyond = [
+        words
+        if (reason := reason_of(system, scene.situation.name, name)) is None
+        else f"{words}: {reason}"
+        for name, _, words in scene.beyond(system)
+    ]
+    return [*beyond, *known]
 
 
 def _numbers(suite: Suite) -> dict[str, Any]:
@@ -444,7 +613,8 @@ def _panel(axes: Axes, scene: Scene, system: str) -> None:
     points = np.zeros((SAMPLES, 3))
     points[:, 2] = middle + np.linspace(-reach, reach, SAMPLES)
     axes.set_xlim(points[0, 2], points[-1, 2])
-    ground = ground_path.heights_under(scene.comparison.animation.terrain, points, ground_path.SKY)
+    top = clip.positions_ws[..., 1].max()  # below a ceiling
+    ground = ground_path.heights_under(scene.comparison.animation.terrain, points, top)
     style.earth(axes, points[:, 2], ground)
     _title(axes, [_short(motion, bounded.name) for bounded in scene.beyond(system)])
 

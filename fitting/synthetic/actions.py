@@ -1,4 +1,4 @@
-"""Synthetic actions besides walking: a run, a jump, a crouch, a turn in place.
+"""Synthetic actions besides walking: a run, a jump, a crouch, sitting, an idle, a turn in place.
 
 Each is on the floor y = 0 and begins at the origin, facing +z, with its true contact labels. Feet
 stand still exactly; the pelvis moves smoothly, and falls freely while no foot stands.
@@ -7,6 +7,7 @@ stand still exactly; the pelvis moves smoothly, and falls freely while no foot s
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.interpolate import BPoly
 
 from fitting.clips.clip import Clip
@@ -25,6 +26,9 @@ FLIGHT, LENGTH = 0.46, 0.6  # s and m, of a jump
 COUNTERMOVEMENT = 0.24  # m, by which the pelvis sinks before a jump and after it
 BENT = 0.06  # m, by which it is lower when the feet leave the ground: their toes come up slowly
 DEPTH = 0.33  # m, of a crouch
+SQUAT, SQUAT_BACK = 0.52, 0.28  # m, by which the pelvis goes down and back in a squat
+SEAT, SEAT_BACK = 0.34, 0.36  # m, by which the pelvis goes down and back onto a bench
+SWAY, SWAY_SECONDS = 0.005, 3.0  # m to either side and s, of an idle
 STEP_ANGLE, STEP_SECONDS = np.radians(45.0), 0.4  # of a turn, for each step of a foot
 
 Knot = tuple[float, ...]  # s, then the height, m, and what is known of its derivatives
@@ -76,16 +80,40 @@ def jump(seconds: float, fps: float = 60.0) -> Clip:
 
 def crouch(seconds: float, fps: float = 60.0) -> Clip:
     """Down into a crouch, and up again; the feet stand flat all the time."""
-    time, sink = _times(seconds, fps), 0.25 * seconds
-    down = smoothstep((time - 0.15 * seconds) / sink)
-    up = smoothstep((time - 0.6 * seconds) / sink)
-    height = STANDING - DEPTH * (down - up)
-    pelvis = np.stack([np.zeros_like(time), height, np.zeros_like(time)], axis=1)
-    feet = [
-        stepping_foot(time, [Foothold(-1.0, seconds + 1.0, s * TRACK, BALL_AHEAD)], Swing(0, 0))
-        for s in SIDES
-    ]
-    return _clip("crouch", Body(pelvis, np.zeros_like(time), (feet[0], feet[1]), fps))
+    return _on_flat_feet("crouch", _down_and_up(seconds, fps)[:, None] * [0.0, -DEPTH, 0.0], fps)
+
+
+def squat(seconds: float, fps: float = 60.0) -> Clip:
+    """Down until the legs hardly fold further, the pelvis behind the heels, and up again."""
+    way = _down_and_up(seconds, fps)[:, None] * [0.0, -SQUAT, -SQUAT_BACK]
+    return _on_flat_feet("squat", way, fps)
+
+
+def sit(seconds: float, fps: float = 60.0) -> Clip:
+    """Down onto a bench behind the feet, and up again."""
+    way = _down_and_up(seconds, fps)[:, None] * [0.0, -SEAT, -SEAT_BACK]
+    return _on_flat_feet("sit", way, fps)
+
+
+def idle(seconds: float, fps: float = 60.0) -> Clip:
+    """Standing still, but for a sway of the pelvis from side to side."""
+    sway = SWAY * np.sin(2.0 * np.pi * _times(seconds, fps) / SWAY_SECONDS)
+    return _on_flat_feet("idle", sway[:, None] * [1.0, 0.0, 0.0], fps)
+
+
+def _down_and_up(seconds: float, fps: float) -> Float64[np.ndarray, " frames"]:
+    """0..1, from standing to as low as it goes, and back."""
+    part = _times(seconds, fps) / seconds
+    return smoothstep((part - 0.15) / 0.25) - smoothstep((part - 0.6) / 0.25)
+
+
+def _on_flat_feet(name: str, moved: Float64[np.ndarray, "frames 3"], fps: float) -> Clip:
+    """A body whose feet stand, and whose pelvis moves by so much, m."""
+    time = np.arange(len(moved)) / fps
+    still = [Foothold(-1.0, time[-1] + 1.0, side * TRACK, BALL_AHEAD) for side in SIDES]
+    left, right = (stepping_foot(time, [foothold], Swing(0.0, 0.0)) for foothold in still)
+    pelvis = moved + [0.0, STANDING, 0.0]
+    return _clip(name, Body(pelvis, np.zeros_like(time), (left, right), fps))
 
 
 def turn(seconds: float, fps: float = 60.0) -> Clip:
