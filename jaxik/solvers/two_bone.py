@@ -1,4 +1,4 @@
-"""A two-bone limb: its knee bends about a hinge, then its hip swings.
+"""A two-bone limb: its knee bends about a hinge, then its hip swings, freely or towards a pole.
 
 Half-angle algebra throughout: angles appear only as cosine and sine of half the angle. The
 formulas follow ozz-animation's two-bone job, with derivatives written by hand where JAX's own
@@ -10,9 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
+from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import struct
 
-from .rotations import DOWN, clip_cosine, safe_arc
+from .rotations import DOWN, LENGTH_BAND, PoleTarget, angle_about, clip_cosine, safe_arc
+
+STRETCH_BAND = 0.01
 
 
 @struct
@@ -181,3 +184,137 @@ def _realignment(start: Array, aim: Array, hinge: Array) -> tuple[Array, Array]:
     return quat.half_angle(
         jnp.where(known, cos * inverse, 1.0), jnp.where(known, sin * inverse, 0.0)
     )
+
+
+def third_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
+    """Third side of a triangle by the law of cosines.
+
+    Args:
+        a2: square of one side.
+        b2: square of another side.
+        ab: product of the two.
+        cos: cosine of the angle between them.
+    """
+    return vec.safe_sqrt(a2 + b2 - 2.0 * ab * cos)
+
+
+def stretch_to(distance: Array, free: Array, most: Array, gate: AbstractGate) -> Array:
+    """By how much a limb's bones are longer than they are, so that it reaches a target.
+
+    Args:
+        distance: of the target, m.
+        free: how far the limb reaches freely, m; one that reaches nowhere is not stretched.
+        most: the longest that bones may be, as a multiple of what they are.
+        gate: how that is limited.
+    """
+    ratio = vec.safe_divide(distance, free, otherwise=1.0)
+    return gate.clip(ratio, jnp.ones_like(ratio), most, band=STRETCH_BAND)
+
+
+def soft_limit(x: Array, free: Array, limit: Array) -> Array:
+    """`x` up to `free`; beyond that an exponential, of slope 1 at first, that tends to `limit`."""
+    room = limit - free
+    has_room = room > 0
+    excess = x - free
+    beyond = excess > 0
+    fraction = jnp.where(beyond, excess, 0.0) / jnp.where(has_room, room, 1.0)
+    soft = free - jnp.where(has_room, room * jnp.expm1(-fraction), 0.0)
+    return jnp.where(beyond, soft, x)
+
+
+def quartic_limit(x: Array, free: Array, limit: Array) -> Array:
+    """`x` up to `free`; beyond that ozz-animation's curve, which tends to `limit`.
+
+    Its slope is 4/3 at first, so that it exceeds `x` by up to 2.8 % of the room between `free` and
+    `limit`. Where there is no room, `x` is returned unlimited.
+    """
+    room = limit - free
+    has_room = room > 0
+    beyond = has_room & (x > free)
+    fraction = jnp.where(beyond, x - free, 0.0) / jnp.where(has_room, room, 1.0)
+    left = (3.0 / (fraction + 3.0)) ** 4
+    return jnp.where(beyond, limit - room * left, x)
+
+
+def bend_to_pole(
+    limb: Limb,
+    target: PoleTarget,
+    soften: Array,
+    gate: AbstractGate,
+    max_stretch: Array | None = None,
+) -> LimbBend:
+    """Bends a limb to its target in the plane that contains the pole.
+
+    The triangle is made of the whole lengths of the bones: unlike with `hinge_half_angle`, a hinge
+    that is not square to the limb leaves the ankle beside its target, and the plane beside the
+    pole. All vectors are in one rigid space and broadcast against each other.
+
+    With the target on the hip, the knee folds and the hip does not rotate. With the pole along the
+    target, the hip takes the shortest arc; with the ankle folded onto the hip, not even that. With
+    a bone of length zero, the knee does not bend. `reached` follows from the lengths alone.
+
+    Args:
+        limb: the limb as it is.
+        target: of the ankle, from the hip; the knee points at the pole.
+        soften: fraction of the bones' length up to which the ankle reaches its target; beyond, it
+            falls short (`quartic_limit`). Clipped to 0..1.
+        gate: decides `reached`.
+        max_stretch: how long bones may become for a target out of reach, as a multiple of what they
+            are; None leaves them.
+    """
+    to_hip, to_ankle, hinge = limb.to_hip, limb.to_ankle, limb.hinge
+    a2, b2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
+    thigh, shin = vec.safe_sqrt(a2), vec.safe_sqrt(b2)
+    distance = vec.length(target.to_target)
+    free = jnp.where(soften < 0, 0.0, jnp.where(soften > 1, 1.0, soften)) * (thigh + shin)
+    farthest, nearer, stretch = free, distance, None
+    if max_stretch is not None:
+        stretch = stretch_to(distance, free, max_stretch, gate)
+        # The angles of a longer limb are those of the limb as it is with a nearer target.
+        farthest, nearer = free * max_stretch, distance / stretch
+    reach = quartic_limit(nearer, free, thigh + shin)
+    too_near = gate.below(distance, jnp.abs(thigh - shin), band=LENGTH_BAND)
+    reached = (1.0 - too_near) * gate.below(distance, farthest, band=LENGTH_BAND)
+
+    # The normal of a bent limb: one part along the hinge, and one across it if the hinge is tilted.
+    normal = vec.dot(hinge, vec.cross(to_hip, to_ankle))
+    across = vec.scale(to_ankle, vec.dot(to_hip, hinge)) - vec.scale(
+        to_hip, vec.dot(to_ankle, hinge)
+    )
+    sin_now = _signed_length(normal, vec.dot(across, across), normal, a2 * b2)
+    half_cos, half_sin = triangle_half_angle(
+        a2, b2, reach * reach, vec.dot(to_hip, to_ankle), sin_now
+    )
+
+    bent = quat.rotate(quat.from_half_angle(hinge, half_cos, half_sin), to_ankle) - to_hip
+    return LimbBend(_pole_swing(bent, hinge, target), half_cos, half_sin, reached, stretch)
+
+
+def _pole_swing(bent: Array, hinge: Array, target: PoleTarget) -> Array:
+    """Rotation of the hip that points the bent limb at its target and its knee at the pole."""
+    to_target = target.to_target
+    away = vec.dot(to_target, to_target) > jnp.finfo(to_target.dtype).eps ** 2
+    aim = vec.normalize(to_target, vec.constant(DOWN, to_target))
+    arc = safe_arc(vec.normalize(bent, aim), aim, hinge)
+    normal = quat.rotate(arc, hinge)
+    pole = vec.normalize(target.pole, vec.constant((0.0, 0.0, 0.0), target.pole))
+    cos, sin, known = angle_about(aim, normal, vec.cross(aim, pole))
+    # Ozz measures the angle between the normals, not between their parts across the target. The
+    # two differ only for a tilted hinge.
+    along = vec.dot(normal, aim)
+    sin = _signed_length(sin, (along * cos) ** 2, vec.dot(normal, pole), jnp.ones_like(along))
+    cos = cos * vec.length(vec.reject(normal, aim))
+    facing = quat.from_cos_sin(aim, jnp.where(known, cos, 1.0), jnp.where(known, sin, 0.0))
+    swing = quat.multiply(quat.normalize(facing), arc)
+    swing = quat.multiply(quat.from_axis_angle(aim, target.twist), swing)
+    return jnp.where(away[..., None], swing, quat.identity(swing.dtype))
+
+
+def _signed_length(x: Array, across2: Array, sign: Array, scale2: Array) -> Array:
+    """Length, with the given sign, of a vector with `x` along an axis and root `across2` across it.
+
+    `x` itself, with its gradient through zero, where `across2` is rounding error beside `scale2`.
+    """
+    tilted = across2 > (8.0 * jnp.finfo(x.dtype).eps) ** 2 * scale2
+    length = vec.safe_sqrt(x * x + jnp.where(tilted, across2, 0.0))
+    return jnp.where(tilted, jnp.where(sign < 0, -length, length), x)

@@ -11,9 +11,7 @@ from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, Rule, angle, length, option, ratio, switch
 from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import struct
-from jaxik.solvers.aim import aim_rotation
-from jaxik.solvers.pole import PoleTarget
-from jaxik.solvers.rotations import local_correction, rotation_about
+from jaxik.solvers.rotations import PoleTarget, aim_rotation, local_correction, rotation_about
 from jaxik.world.frame import FORWARD, UP, Frame, GroundHits, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Transform
 from jaxik.world.terrain import Hit, cast

@@ -13,10 +13,17 @@ from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Declared, Leaf, Rule, angle, length, option, ratio, switch
 from jaxik.maths.struct import struct
-from jaxik.solvers.pole import PoleTarget, bend_to_pole
-from jaxik.solvers.reach import LENGTH_BAND, soft_limit, stretch_to, third_side
-from jaxik.solvers.rotations import local_correction
-from jaxik.solvers.two_bone import Limb, LimbBend, hinge_half_angle, swing_rotation
+from jaxik.solvers.rotations import LENGTH_BAND, PoleTarget, local_correction
+from jaxik.solvers.two_bone import (
+    Limb,
+    LimbBend,
+    bend_to_pole,
+    hinge_half_angle,
+    soft_limit,
+    stretch_to,
+    swing_rotation,
+    third_side,
+)
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 

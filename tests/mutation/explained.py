@@ -75,7 +75,9 @@ REASONS = {
         ("length // 2", "length // 3", "two thirds of a chain teach as much as its last half")
     ],
     "jaxik/solvers/two_bone.py": [
-        ("tiny**0.5", "tiny** 1.5", "nearer to the pole than 1e-8, rounding decides")
+        ("tiny**0.5", "tiny** 1.5", "nearer to the pole than 1e-8, rounding decides"),
+        (".eps ** 2", ".eps ** 3", "a distance of 1e-16 m or 1e-24 m is nothing either way"),
+        ("has_room, room, 1.0", "has_room, room, 2.0", STAND_IN),
     ],
     "jaxik/batching/lanes.py": [("@jax.checkpoint", "", SPEED)],
     "jaxik/batching/primitives.py": [("UNROLLED_SUM = 8", "", SPEED)],
@@ -93,10 +95,6 @@ REASONS = {
     "jaxik/pipeline/simulation.py": [
         ("count, rig.side.shape[0]", "count, rig.side.shape[ -1]", "there is one axis")
     ],
-    "jaxik/solvers/pole.py": [
-        (".eps ** 2", ".eps ** 3", "a distance of 1e-16 m or 1e-24 m is nothing either way")
-    ],
-    "jaxik/solvers/reach.py": [("has_room, room, 1.0", "has_room, room, 2.0", STAND_IN)],
     "jaxik/stages/fade.py": [
         ("beyond, distance, 1.0", "beyond, distance, 2.0", STAND_IN),
         ("(behind, gap, 1.0), 0.0)", "(behind, gap, 1.0), 1.0)", STAND_IN),

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxik.maths import quat
 from jaxik.maths.gate import HARD
-from jaxik.solvers import aim, pole
-from jaxik.solvers.two_bone import Limb
+from jaxik.solvers.rotations import PoleTarget, aim_rotation
+from jaxik.solvers.two_bone import Limb, bend_to_pole
 
 FIRM = {"hip": 8.5e-4, "knee": 1.2e-5, "ankle": 1.1e-5}  # rad, rad and m
 SOFT = {"hip": 3.2e-3, "knee": 1.6e-3, "ankle": 1.3e-3}
@@ -97,8 +97,8 @@ def bend(
 ) -> tuple[jax.Array, ...]:
     """Corrections of hip and knee, the ankle in the space of the start joint, and `reached`."""
     to_hip, to_ankle, hinge = limb
-    target_and_pole = pole.PoleTarget(*target)
-    bent = pole.bend_to_pole(Limb(to_hip, to_ankle, hinge), target_and_pole, soften, HARD)
+    target_and_pole = PoleTarget(*target)
+    bent = bend_to_pole(Limb(to_hip, to_ankle, hinge), target_and_pole, soften, HARD)
     half = bent.half_cos, bent.half_sin
     start = weighted(bent.swing, weight)
     knee_rot = weighted(quat.from_half_angle(hinge, *half), weight)
@@ -124,7 +124,7 @@ def solve_two_bone(rows: Table, dtype: DTypeLike = jnp.float64) -> Solution:
 @jax.jit
 def aim_joint(target: list[Any], axes: list[Any], weight: Any) -> tuple[jax.Array, jax.Array]:
     forward, offset, up = axes
-    rot, reached = aim.aim_rotation(pole.PoleTarget(*target), forward, offset, up, HARD)
+    rot, reached = aim_rotation(PoleTarget(*target), forward, offset, up, HARD)
     return weighted(rot, weight), reached == 1
 
 

@@ -12,10 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import HARD, AbstractGate, Smooth
-from jaxik.solvers import aim, rotations, two_bone
-from jaxik.solvers import pole as poles
-from jaxik.solvers.reach import quartic_limit, soft_limit
-from jaxik.solvers.two_bone import Limb
+from jaxik.solvers import rotations, two_bone
+from jaxik.solvers.two_bone import Limb, quartic_limit, soft_limit
 from reference import maths
 from reference.sample_poses import rotation_angle
 from reference.stages import limb as reference
@@ -34,8 +32,8 @@ RNG = np.random.default_rng(0)
 @jax.jit
 def bend(to_hip, to_ankle, hinge, to_target, pole, soften, twist, gate: AbstractGate = HARD):
     """`bend_to_pole` of plain arrays."""
-    target = poles.PoleTarget(to_target, pole, twist)
-    return poles.bend_to_pole(Limb(to_hip, to_ankle, hinge), target, soften, gate)
+    target = rotations.PoleTarget(to_target, pole, twist)
+    return two_bone.bend_to_pole(Limb(to_hip, to_ankle, hinge), target, soften, gate)
 
 
 @jax.jit
@@ -215,8 +213,10 @@ def test_legs_batches_and_targets_broadcast():
 
 
 def aim_rotation(to_target, forward, offset, up, pole, twist, gate: AbstractGate = HARD):
-    """`aim.aim_rotation` of plain arrays."""
-    return aim.aim_rotation(poles.PoleTarget(to_target, pole, twist), forward, offset, up, gate)
+    """`rotations.aim_rotation` of plain arrays."""
+    return rotations.aim_rotation(
+        rotations.PoleTarget(to_target, pole, twist), forward, offset, up, gate
+    )
 
 
 aimed = jax.jit(aim_rotation)
