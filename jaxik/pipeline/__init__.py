@@ -1,4 +1,4 @@
-"""The pipeline: a system of rules, and how frames of animation go through it.
+"""The pipeline: a system of thirteen rules, and how frames of animation go through it.
 
 Everything here is for one character; batch with `jaxik.lanes` or `jax.vmap`. Start with
 `system.FootIK`, then `phases.solve`, which is the whole algorithm.

@@ -32,7 +32,7 @@ Tree = TypeVar("Tree")
 
 
 class FootIK(Rule):
-    """A foot-IK system: one rule for each of twelve stages, and how strides are scaled.
+    """A foot-IK system: one rule for each of thirteen stages.
 
     Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
     numbers with `jaxik.maths.parameter_tree.replace`:

@@ -1,4 +1,4 @@
-"""Stage 9: where each leg goes once the body has moved, and how much foot IK it gets."""
+"""Stage 10: where each leg goes once the body has moved, and how much foot IK it gets."""
 
 from abc import abstractmethod
 

@@ -1,4 +1,4 @@
-"""Stage 12: how foot IK fades in and out; nothing pops when a weight or `Frame.grounded` jumps.
+"""How foot IK fades in and out, so that nothing pops when a weight or `Frame.grounded` jumps.
 
 The stage runs in two places: after the pelvis, where the body moves to where pelvis and lean want
 it, and after the effector, where each leg's weight moves to the one that it is to have.

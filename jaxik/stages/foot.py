@@ -1,4 +1,4 @@
-"""Stage 11: ankle rotations that align the feet with the ground."""
+"""Stage 12: ankle rotations that align the feet with the ground."""
 
 import dataclasses
 from abc import abstractmethod

@@ -1,4 +1,4 @@
-"""Stage 10: two-bone legs that bring the ankles to their targets."""
+"""Stage 11: two-bone legs that bring the ankles to their targets."""
 
 # pyright: reportInvalidTypeVarUse=false
 

@@ -1,4 +1,4 @@
-"""Stage 7: feet that foot IK has moved together keep a distance sideways."""
+"""Stage 8: feet that foot IK has moved together keep a distance sideways."""
 
 from abc import abstractmethod
 

@@ -1,4 +1,4 @@
-"""Stage 4: the foothold of each foot, with the height of the ground smoothed over time."""
+"""Stage 5: the foothold of each foot, with the height of the ground smoothed over time."""
 
 from abc import abstractmethod
 from math import inf

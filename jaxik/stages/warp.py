@@ -1,4 +1,4 @@
-"""Strides scaled and turned for a character that moves otherwise than its animation."""
+"""Stage 3: strides scaled and turned for a character that moves otherwise than its animation."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Stage 5: how the body leans on slopes.
+"""Stage 6: how the body leans on slopes.
 
 `base` has the abstract rule, `slope` the lean of the record, which tilts the whole body, `spine`
 that of people, which bends the spine. To write a rule, start with `base.AbstractLean`.

@@ -1,4 +1,4 @@
-"""Stage 6: locks that keep standing feet in place in the world.
+"""Stage 7: locks that keep standing feet in place in the world.
 
 `base` has the abstract rule, `offset` the lock of the record, `plant` that of Mec. To write a rule,
 start with `base.AbstractLock`.

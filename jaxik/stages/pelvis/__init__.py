@@ -1,4 +1,4 @@
-"""Stage 8: how far the body sinks or rises so that its legs can reach the ground.
+"""Stage 9: how far the body sinks or rises so that its legs can reach the ground.
 
 `base` has the abstract rule and its memory, `games` the rules of ozz, Unreal, Mec and the record,
 `people` those modelled on people. To write a rule, start with `base.AbstractPelvis`, or with

@@ -1,4 +1,4 @@
-"""Stage 3: rays that find the ground under each foot.
+"""Stage 4: rays that find the ground under each foot.
 
 `base` has the abstract rule and what all share, `limits` decides which ground is refused, `games`
 has the rules of ozz, Unreal, Mec and the record, `stride` the one that looks ahead to the next
