@@ -115,6 +115,7 @@ def _off(ik: jaxik.FootIK) -> tuple[str, ...]:
     names += () if options.get("probe.limited") else LIMITS
     names += () if options.get("probe.check_support") else SUPPORT
     names += () if options.get("leg.allow_stretch") else ("leg.max_stretch",)
+    names += () if options.get("probe.simple_in_flight") else ("probe.flight_layers",)
     names += () if options.get("foot.bend_toes") else ("foot.toe_length", "foot.max_toe_")
     if not _is_on(ik, "root.enabled"):
         return names + ROOT

@@ -206,10 +206,9 @@ def option(default: bool, doc: str) -> Declared:
     return eqx.field(default=default, static=True, kw_only=True, metadata={"doc": doc})
 
 
-def layers(default: int = ALL_LAYERS) -> Declared:
+def layers(doc: str = "Layers of the terrain that the rays see, one bit each.") -> Declared:
     """Declares a mask of the layers that a rule's rays see, one bit a layer (`layer_mask`)."""
-    doc = "Layers of the terrain that the rays see, one bit each."
-    return _field(default, as_layers, {"doc": doc})
+    return _field(ALL_LAYERS, as_layers, {"doc": doc})
 
 
 def _field(default, converter, metadata: dict):

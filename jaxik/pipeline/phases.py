@@ -101,7 +101,7 @@ def sense(
         inputs, warp_ws = _warped(ik, inputs, turn)
         frame = inputs.frame
     with jax.named_scope("probe"):
-        ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
+        ground = ik.probe.ground(inputs, contact, ik.target.foot_height)
     with jax.named_scope("target"):
         foothold = ik.target.sense(inputs, ground, contact)
     with jax.named_scope("lean"):

@@ -141,9 +141,11 @@ SWITCHES = """
 AimFoot.bend_toes=no AimFoot.enabled=yes BodyEffector.by_contact=no BodyEffector.latch=no
 CapsulePelvis.enabled=yes
 CornerProbe.active=yes CornerProbe.by_height=yes CornerProbe.by_speed=no
-CornerProbe.check_support=no CornerProbe.limited=yes DirectEffector.by_contact=no
+CornerProbe.check_support=no
+CornerProbe.simple_in_flight=no CornerProbe.limited=yes DirectEffector.by_contact=no
 DirectEffector.if_found=no
 FadeEffector.by_contact=no FlatFoot.bend_toes=no FootProbe.check_support=no
+FootProbe.simple_in_flight=no
 FootProbe.limited=yes FootProbe.use_toe=yes
 GroundRoot.enabled=yes HeelEffector.by_contact=no
 LegLengthPelvis.damp=yes LegLengthPelvis.enabled=yes LowestPelvis.enabled=yes
@@ -151,8 +153,10 @@ LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=y
 OffsetLock.hold_ball=no PlantLock.plant=yes KeepFoot.bend_toes=no
 PitchRollFoot.bend_toes=no PoleLeg.allow_stretch=no PoleLeg.enabled=yes
 PoleLeg.to_hint=no ReachPelvis.spring=no
-RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
-SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
+RootProbe.check_support=no
+RootProbe.simple_in_flight=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
+SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no
+StrideProbe.simple_in_flight=no StrideProbe.limited=yes
 StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no
 StrideProbe.use_strides=yes
 SupportPelvis.spring=no TwoBone.allow_stretch=no TwoBone.as_animated=no

@@ -1,27 +1,33 @@
 """What Unreal and Mecanim have besides: legs that stretch, toes that bend, feet that are turned.
 
+And simple ground in flight.
+
 Each against geometry or NumPy, its limits, precision and derivatives.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from fitting.runtime.precision import with_floats
-from jaxik.maths import quat
-from jaxik.maths.gate import HARD
+from jaxik.maths import parameter_tree, quat
+from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.stages.foot import KeepFoot, SolvedFoot
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.stages.leg import LegGoal, TwoBone
+from jaxik.stages.probe import FootProbe, StrideProbe
 from jaxik.stages.warp import StrideWarp
 from jaxik.world import terrain
 from jaxik.world.frame import Contact, Frame, GroundHits, Rays, Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 from jaxik.world.terrain import Hit
-from support.cases import Either
+from support.cases import RIG, Either, clip
+from support.clips import to_rig
 from support.fragments import fragment
 from support.gradients import (
     assert_gradients_match,
@@ -38,7 +44,7 @@ BENT = np.array([0.0, -0.4125, 0.153114])  # m, from hip to knee, with the ankle
 WAY = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
 
 
-def solved(rule, targets, weight=1.0, gate=HARD):
+def solved(rule, targets, weight=1.0, gate: AbstractGate = HARD):
     """Knees and ankles (legs 3) of legs with their hips at the origin, m; stretch, and reached."""
     floats = targets.dtype
     zero, ones = jnp.zeros_like(targets), jnp.ones_like(targets[..., 0])
@@ -115,7 +121,7 @@ def height_of(slopes, steps, x, z):
     return slopes[strip] * z + jnp.where(z > 0.03, steps[strip], 0.0)
 
 
-def bent(rule, slopes, steps, raised, weight=1.0, gate=HARD):
+def bent(rule, slopes, steps, raised, weight=1.0, gate: AbstractGate = HARD):
     """The rotations of toes (legs 4), and their corrections; feet are turned by slope and heel."""
     floats = slopes.dtype
     up = jnp.asarray([0.0, 1.0, 0.0], floats)
@@ -158,7 +164,7 @@ def lying_toes(slope: float, step: float) -> float:
 
     def over(pitch: float) -> float:  # of the ground over the toes' sole
         normal = np.array([-np.sin(pitch), np.cos(pitch)])
-        return normal @ (ground - ball) + SOLE
+        return float(normal @ (ground - ball)) + SOLE
 
     low, high = -1.5, 1.5
     for _ in range(60):
@@ -217,7 +223,7 @@ WARP = {"max_angle": 1.2, "pelvis_share": 0.3, "half_life": 0.2}
 DT = 0.05  # s
 
 
-def turned(rule, orientation, grounded, weight, points, bearing, gate=HARD):
+def turned(rule, orientation, grounded, weight, points, bearing, gate: AbstractGate = HARD):
     """The turns of frames, rad, and hips and ankles (frames legs 3), m, of legs at `points`."""
     rig = fragment(Rig, present=jnp.array([True, True, False]), side=jnp.zeros(3, points.dtype))
 
@@ -227,10 +233,9 @@ def turned(rule, orientation, grounded, weight, points, bearing, gate=HARD):
         still = 0.0 * points[:, :1] + quat.identity(points.dtype)
         joint = Transform(points, still)
         pose = LegPose(joint, joint, joint, joint)
-        frame = Frame(
-            **dict.fromkeys(REQUIRED)
-            | {"weight": weight, "grounded": grounded, "orientation": orientation, "pose": pose}
-        )
+        fields: dict[str, Any] = dict.fromkeys(REQUIRED)
+        fields |= {"weight": weight, "grounded": grounded, "orientation": orientation, "pose": pose}
+        frame = Frame(**fields)
         goal = rule.sense(fragment(Inputs, frame=frame, rig=rig, gate=gate))
         state, turn = rule.advance(
             Moment(jnp.asarray(DT, points.dtype), started, gate), goal, state
@@ -298,3 +303,51 @@ def test_a_turn_has_right_and_finite_derivatives_all_round():
         assert_gradients_match(feet, WARP, np.array([0.3, 2.5, -1.0]), blurred)
         finite_jacobian(feet, WARP, np.array([0.0, np.pi, -np.pi / 2]), blurred)
         finite_jacobian(feet, WARP, np.array([0.0, 0.0, 1.2]), blurred)
+
+
+# Simple ground for feet in flight.
+
+COMPLEX, SIMPLE = (terrain.layer_mask(layer) for layer in (0, 1))
+
+
+@jax.jit
+def grounds(probe, simple, frames, weight):
+    """What a probe finds for contacts of these weights (frames legs): 10 cm, or sloping ground."""
+    ground = terrain.combine(
+        terrain.plane((0.0, 0.1, 0.0), layer=0),
+        terrain.plane((0.0, 0.02, 0.0), (0.0, 1.0, -0.2), layer=1),
+    )
+    seen = parameter_tree.replace(probe, {"flight_layers": simple})
+
+    def ground_of(frame, weight):
+        contact = Contact(weight, weight, weight, 1.0 - weight)
+        return seen.ground(Inputs(to_rig(RIG), ground, frame, HARD), contact, jnp.asarray(0.08))
+
+    return jax.vmap(ground_of)(frames, weight)
+
+
+@pytest.mark.parametrize(
+    "probe", [FootProbe(layers=COMPLEX), StrideProbe(layers=COMPLEX)], ids=["foot", "stride"]
+)
+def test_feet_in_flight_see_simple_ground_and_standing_feet_the_other(probe):
+    frames = clip("walks" if isinstance(probe, StrideProbe) else "goes forward")
+    count = len(frames.dt)
+    weight = jnp.stack([jnp.linspace(0.0, 1.0, count), jnp.linspace(1.0, 0.0, count)], axis=-1)
+    both = dataclasses.replace(probe, simple_in_flight=True)
+    complex_only = grounds(probe, SIMPLE, frames, weight)
+    simple_only = grounds(dataclasses.replace(probe, layers=SIMPLE), SIMPLE, frames, weight)
+    fraction, known = (np.asarray(getattr(frames.stride, x)) for x in ("fraction", "known"))
+    apart = 4.0 * fraction * (1.0 - fraction)
+    share = (1.0 - np.asarray(weight)) * (1.0 + known * (apart**2 * (3.0 - 2.0 * apart) - 1.0))
+    for simple, seen in ((SIMPLE, 1.0), (terrain.layer_mask(9), 0.0)):
+        mixed = grounds(both, simple, frames, weight)
+        found = [(1.0 - share) * complex_only.ankle.found, seen * share * simple_only.ankle.found]
+        np.testing.assert_allclose(mixed.ankle.found, sum(found), rtol=0, atol=1e-9)
+        part = (found[1] / np.maximum(sum(found), 1e-300))[..., None]
+        points = [np.asarray(x.ankle.point) for x in (complex_only, simple_only)]
+        expected = (1.0 - part) * points[0] + part * points[1]
+        there = sum(found) > 1e-6
+        np.testing.assert_allclose(np.asarray(mixed.ankle.point)[there], expected[there], atol=1e-9)
+    between = np.linalg.norm(points[0] - points[1], axis=-1)
+    assert between.max() > 0.05 and share.max() > 0.5 and share.min() < 0.01
+    np.testing.assert_array_equal(mixed.rays.layers, COMPLEX)

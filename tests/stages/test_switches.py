@@ -178,7 +178,7 @@ CASES: dict[str, tuple[Case, ...]] = {
 LARGE = "ozz", "mec"  # whose derivatives take long to compile
 # In `test_own_rules`, `test_limits`, `test_foot_placement` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
-IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_")
+IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
 
 
 @functools.cache

@@ -45,6 +45,10 @@ class AbstractProbe(Rule):
         """
         return None, None
 
+    def ground(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        """The ground that counts, as `sense` finds it."""
+        return self.sense(inputs, contact, foot_height)
+
     @abstractmethod
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         """The ground under each leg in this frame; `foot_height` is from sole to ankle, m."""
@@ -92,6 +96,22 @@ def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
 def with_weight(hit: Hit, found: Array) -> Hit:
     """The hit with another weight `found`."""
     return dataclasses.replace(hit, found=found)
+
+
+def mixed(hit: Hit, other: Hit, up_ws: Array) -> Hit:
+    """Both hits, each by how far it is found; these weights add up to at most 1."""
+    found = hit.found + other.found
+    share = vec.safe_divide(other.found, found)
+    platform = None
+    if hit.platform is not None and other.platform is not None:
+        platform = jnp.where(share > 0.5, other.platform, hit.platform)
+    return Hit(
+        lerp(hit.point, other.point, share[..., None]),
+        vec.normalize(lerp(hit.normal, other.normal, share[..., None]), up_ws),
+        lerp(hit.distance, other.distance, share),
+        found,
+        platform,
+    )
 
 
 def no_hit(like: Hit) -> Hit:

@@ -1,5 +1,6 @@
 """Which ground a foot may stand on: neither too high, nor too low, too steep or too narrow."""
 
+import dataclasses
 import functools
 import math
 
@@ -7,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxik.maths import vec
+from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, angle, constant, length, option, ratio
 from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
+from jaxik.world.frame import Contact, GroundHits
 from jaxik.world.terrain import Hit, cast
 
-from .base import AbstractProbe, foot_heading, level_origin
+from .base import AbstractProbe, foot_heading, level_origin, mixed, with_weight
 
 RING = tuple(  # forward and right of the rays that look for support around a foothold
     (math.cos(turn), math.sin(turn)) for turn in (i * math.pi / 4 for i in range(8))
@@ -41,6 +43,10 @@ class AbstractLimitedProbe(AbstractProbe):
 
     Feet stand over gaps narrower than `support_radius`, in the ground and between planks
     (`cast_over_gaps`): what lies that far to either side carries them.
+
+    With `simple_in_flight`, as simple and complex collision in Unreal's Foot Placement, feet in
+    flight see `flight_layers` and standing feet `layers`, in between by their contact. A swing
+    whose footholds are known goes over from one to the other as it leaves and lands.
 
     Ground fades out over `step_fade`, `SLOPE_FADE` and `SUPPORT_FADE` beyond its limit: `found`
     falls from 1 to 0.
@@ -71,6 +77,39 @@ class AbstractLimitedProbe(AbstractProbe):
     check_support: bool = option(
         False, "Whether narrow ground is refused, which takes nine times as many rays."
     )
+    flight_layers: Leaf = parameter_tree.layers(
+        "Layers that count for feet in flight, one bit each."
+    )
+    simple_in_flight: bool = option(
+        False, "Whether other layers count for feet in flight, which takes twice as many rays."
+    )
+
+    def ground(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        standing = self.sense(inputs, contact, foot_height)
+        if not self.simple_in_flight:
+            return standing
+        simple = dataclasses.replace(self, **{"layers": self.flight_layers})
+        flying, up = simple.sense(inputs, contact, foot_height), inputs.terrain.leg_up_ws
+        stride = inputs.frame.stride
+        # A swing that is known begins and ends on what its foot stands on.
+        apart = 4.0 * stride.fraction * (1.0 - stride.fraction)
+        share = (1.0 - contact.weight) * (1.0 - stride.known * (1.0 - smoothstep(apart)))
+
+        def weighed(hit: Hit, other: Hit) -> Hit:
+            first = with_weight(hit, (1.0 - share) * hit.found)
+            return mixed(first, with_weight(other, share * other.found), up)
+
+        names = ("swing", "lift", "pitch", "support")
+        blended = {
+            name: lerp(value, getattr(flying, name), share)
+            for name in names
+            if (value := getattr(standing, name)) is not None
+        }
+        hits = {
+            name: weighed(getattr(standing, name), getattr(flying, name))
+            for name in ("ankle", "toe", "corner")
+        }
+        return dataclasses.replace(standing, **hits, **blended)
 
     def cast(
         self,
@@ -109,18 +148,8 @@ class AbstractLimitedProbe(AbstractProbe):
         # Ground that is refused for its slope may be hit by both rays.
         lies_below = below.distance + above > first.distance + SAME_GROUND
         lower = jnp.where(lies_below, (1.0 - accepted[0]) * accepted[1], 0.0)
-        found = accepted[0] + lower
-        lower = vec.safe_divide(lower, found)
-        platform = None
-        if first.platform is not None and below.platform is not None:
-            platform = jnp.where(lower > 0.5, below.platform, first.platform)
-        return Hit(
-            lerp(first.point, below.point, lower[..., None]),
-            vec.normalize(lerp(first.normal, below.normal, lower[..., None]), up),
-            lerp(first.distance, below.distance + above, lower),
-            found,
-            platform,
-        )
+        below = dataclasses.replace(below, distance=below.distance + above, found=lower)
+        return mixed(with_weight(first, accepted[0]), below, up)
 
     def cast_over_gaps(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
         """What carries feet below these points: `cast`, or the lower side of a narrow gap.
