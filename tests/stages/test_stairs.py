@@ -1,20 +1,30 @@
-"""Random flights of stairs: the quick sibling of `python -m stairs`."""
+"""Random flights of stairs, the quick sibling of `python -m stairs`, and a few other grounds."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
 import jaxik
+from stairs import grounds
 from stairs.__main__ import BOUNDS
-from stairs.flights import sample
-from stairs.walks import walked
+from stairs.flights import Flight, sample
+from stairs.walks import Verdict, walked
+
+
+def beyond(chosen: Sequence[Flight]) -> list[tuple[Flight, Verdict]]:
+    """Those on which a walk by `stride` is beyond its bounds."""
+    verdicts = walked(jaxik.presets.stride(), chosen)
+    return [pair for pair in verdicts if np.any(np.array(pair[1]) > BOUNDS)]
 
 
 def test_feet_stand_on_treads_and_swing_in_one_arc_on_thirty_random_flights():
     """Heightfields alone, which share one program; the program walks over meshes, too."""
     rng = np.random.default_rng(0)
-    chosen = [sample(rng, field=True) for _ in range(30)]
-    beyond = [
-        (flight, verdict)
-        for flight, verdict in walked(jaxik.presets.stride(), chosen)
-        if np.any(np.array(verdict) > BOUNDS)
-    ]
-    assert not beyond
+    assert not beyond([sample(rng, field=True) for _ in range(30)])
+
+
+def test_they_do_so_on_rubble_curbs_ledges_and_ramps():
+    rng, kinds = np.random.default_rng(0), ("rubble", "curb", "ledge", "ramp")
+    chosen = [ground for ground in (grounds.sample(rng) for _ in range(20)) if ground.kind in kinds]
+    assert len(chosen) >= 10
+    assert not beyond(chosen[:10])

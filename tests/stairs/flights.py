@@ -79,6 +79,10 @@ class Flight:
             return np.interp(z, grid, np.interp(grid, apart, points[:, 1]))
         return np.interp(z, apart, points[:, 1])
 
+    def levels(self, z: np.ndarray) -> np.ndarray:
+        """Height of the way at these places, m, which the root follows."""
+        return self.heights(z)
+
     def clearances(self, points_ws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far points are above the ground and in it, m; both within `TOUCH` of an edge."""
         near = [self.heights(points_ws[..., 2] + away) for away in (-TOUCH, 0.0, TOUCH)]

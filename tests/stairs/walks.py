@@ -122,7 +122,7 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
     )
     # The way before and after it, too, since the root looks a stride ahead and back.
     around = np.array(walk.frames.world_from_model.pos, np.float64)
-    path = flight.heights(turned(around)[:, 2])
+    path = flight.levels(turned(around)[:, 2])
     rise = ground_path.smooth(path, walk.stride * FPS)[first : first + FRAMES]
     return level.translated(rise[:, None] * [0.0, 1.0, 0.0]), level
 
