@@ -309,10 +309,14 @@ def lowest_of(gaps: Sequence[float], weights: Sequence[float]) -> float:
 
 
 def follow_by_gain(
-    parameters: Parameters, low: float, contact: float, before: float | None, dt: float
+    parameters: Parameters,
+    low: float,
+    contact: float,
+    before: float | None,
+    dt: float,
+    resting: float = 0.0,
 ) -> float:
-    """Height of the body after a frame, m, of which feet with a contact want `low`."""
-    resting = before if before and parameters["pelvis.wait_to_rise"] else 0.0
+    """Height of the body after a frame, m, of which feet with a contact want `low`, else rest."""
     low = clip(low, -parameters["pelvis.limit"], parameters["pelvis.limit"])
     goal = lerp(resting, low, contact)
     if before is None:
@@ -338,7 +342,8 @@ def pelvis_height(
         low = min(low, max(0.0, min(gaps, default=0.0)))
     low = max([low, *unfolded_heights(parameters, low, feet, targets, up)])
     contact = max(weights, default=0.0)
-    return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)
+    resting = before if before and parameters["pelvis.wait_to_rise"] else 0.0
+    return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt, resting)
 
 
 def unfolded_heights(
