@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxik
+from jaxik.maths import parameter_tree
 from support import clips
 from support.cases import QUICK, stacked
 from support.clips import BROKEN, to_frames, to_rig, to_terrain
@@ -61,7 +62,11 @@ def jittered(frames: jaxik.Frame) -> jaxik.Frame:
 def result(request) -> jaxik.Result:
     """All that a preset makes of the clips, of these jittered, and of all legs with few weights."""
     ik, rig = getattr(jaxik.presets, request.param)(), to_rig(clips.make_rig())
+    for name in ("leg.allow_stretch", "foot.bend_toes", "probe.simple_in_flight"):
+        ik = parameter_tree.with_option(ik, name, True)
     frames = wandering()
+    orientation = 0.4 * jnp.sin(jnp.arange(FRAMES) / 9.0)
+    frames = dataclasses.replace(frames, orientation=orientation)
     rows = [frames, *at_the_ends(frames)]
     assert len(rows) == ROWS
     faint = [dataclasses.replace(frames, weight=jnp.full((FRAMES, 2), w)) for w in WEIGHTS]
