@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Array, Float64
 
 import jaxik
 from fitting.clips import Clip, flight, load_clip, save_clip
@@ -29,7 +29,7 @@ from fitting.clips.clip_frames import clip_from_result, frames_from_clip, positi
 from fitting.clips.edit import at_speed, in_direction
 from fitting.clips.formats.npz import holds_base
 from fitting.clips.formats.saving import check_clip_file
-from fitting.clips.joint_maps import find_trunk
+from fitting.clips.joint_maps import Trunk, find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
 from fitting.ground import coverage
@@ -400,19 +400,40 @@ class PlacementWarning(UserWarning):
 
 
 def trunk_text(result: jaxik.Result, clip: Clip) -> str:
-    """How far spine and head of the clip lean; "" for a system that does not bend the spine."""
+    """How far spine and head of the clip lean, and the spine twists; "" where neither happens."""
+    trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
+    twist = _twist_text(result, clip, trunk)
+    return "; ".join(filter(None, (_lean_text(result, clip, trunk), twist)))
+
+
+def _twist_text(result: jaxik.Result, clip: Clip, trunk: Trunk) -> str:
+    twist = result.corrections.twist
+    if twist is None:
+        return ""
+    text = f"spine: twists by up to {_largest_angle(twist):.1f}° against the pelvis"
+    if not trunk.twisted:
+        return f"{text}, not applied: the clip has no spine joint between pelvis and head"
+    return f"{text}, shared by {', '.join(clip.joint_names[joint] for joint in trunk.twisted)}"
+
+
+def _lean_text(result: jaxik.Result, clip: Clip, trunk: Trunk) -> str:
     spine = result.corrections.spine
     if spine is None:
         return ""
-    trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
-    angle = np.degrees(2.0 * np.arctan2(np.linalg.norm(spine[:, 1:], axis=1), np.abs(spine[:, 0])))
-    text = f"spine: leans by up to {angle.max():.1f}°"
+    text = f"spine: leans by up to {_largest_angle(spine):.1f}°"
     if trunk.spine is None:
         return f"{text}, not applied: the clip has no spine joint between pelvis and head"
     text += f", applied to {clip.joint_names[trunk.spine]}"
     if trunk.head is None:
         return f"{text}; the clip has no joint named head that turns back"
     return f"{text}; {clip.joint_names[trunk.head]} turns back"
+
+
+def _largest_angle(rots: Array | np.ndarray) -> float:
+    """The angle of the largest of these rotations, degrees."""
+    rots = np.asarray(rots)
+    sines, cosines = np.linalg.norm(rots[:, 1:], axis=1), np.abs(rots[:, 0])
+    return float(np.degrees(2.0 * np.arctan2(sines, cosines)).max())
 
 
 def arrays(motion: measures.PlacedMotion) -> dict[str, np.ndarray]:

@@ -149,6 +149,9 @@ def test_the_joints_of_the_spine_share_a_twist_up_to_where_the_arms_branch_off(c
         )
         expected = root * Rotation.from_rotvec(share * twist.as_rotvec()) * root.inv()
         np.testing.assert_allclose((turn * expected.inv()).magnitude(), 0.0, atol=1e-9)
+    text = "spine: twists by up to 46.1° against the pelvis, "
+    assert animations.trunk_text(twisted, taller) == f"{text}shared by spine, chest"
+    assert animations.trunk_text(twisted, clip).startswith(f"{text}not applied: the clip has no")
     for low, high in ((0, 9), (9, 10), (10, 11), (12, 13)):
         bones = (c.positions_ws[:, high] - c.positions_ws[:, low] for c in (plain, solved))
         turns = (rotation(c.rotations_ws[:, low]).inv() for c in (plain, solved))
