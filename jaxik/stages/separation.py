@@ -103,8 +103,9 @@ class FootSeparation(AbstractSeparation):
         zero = jnp.zeros_like(missing)
         missing = now.gate.clip(missing, zero, zero + jnp.inf, band=DISTANCE_BAND)
         active = sensed.counted
-        free = active * (1.0 - held)
-        share = vec.safe_divide(free[:, None], free[:, None] + free[None, :])
+        free = 1.0 - held
+        moves = active * free  # so that a foot with hardly any weight hardly gives way
+        share = vec.safe_divide(moves[:, None], free[:, None] + moves[None, :])
         opposed = jnp.where(side[:, None] * side[None, :] < 0, active[None, :], 0.0)
         move = now.gate.maximum(opposed * share * missing, band=DISTANCE_BAND)
 

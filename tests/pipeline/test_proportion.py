@@ -65,7 +65,7 @@ def result(request) -> jaxik.Result:
     for name in ("leg.allow_stretch", "foot.bend_toes", "probe.simple_in_flight"):
         ik = parameter_tree.with_option(ik, name, True)
     frames = wandering()
-    orientation = 0.4 * jnp.sin(jnp.arange(FRAMES) / 9.0)
+    orientation = 3.2 * jnp.sin(jnp.arange(FRAMES) / 9.0)
     frames = dataclasses.replace(frames, orientation=orientation)
     rows = [frames, *at_the_ends(frames)]
     assert len(rows) == ROWS
