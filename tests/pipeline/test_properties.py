@@ -146,7 +146,9 @@ def mirrored_row(values: dict[str, Any]) -> Row:
     sides = [(point * FLIP, normal * FLIP) for point, normal in DRIFTING.planes]
     ground = dataclasses.replace(DRIFTING, planes=sides)
     twist = {"leg.twist": -parameter_tree.get(to_ik(values), "leg.twist")}
-    frames = dataclasses.replace(mirrored(wander()), orientation=-wander().orientation)
+    orientation = wander().orientation
+    assert orientation is not None
+    frames = dataclasses.replace(mirrored(wander()), orientation=-orientation)
     return Row(ground, frames, values | twist, rig)
 
 

@@ -59,10 +59,10 @@ def solve_leg(leg: Leg, body: Transform, target: Array) -> Solved:
     distance = length(target - hip.pos)
     nearest, soft_from, _ = _wanted_distance(leg, hip.pos, knee.pos, ankle.pos, distance)
     stretch, farthest = stretched(leg, distance, soft_from)
-    longer = [hip.pos + stretch * (joint.pos - hip.pos) for joint in (knee, ankle)]
-    wanted = _wanted_distance(leg, hip.pos, *longer, distance)[2]
+    long_knee, long_ankle = (hip.pos + stretch * (x.pos - hip.pos) for x in (knee, ankle))
+    wanted = _wanted_distance(leg, hip.pos, long_knee, long_ankle, distance)[2]
     knee_rot = maths.from_axis_angle(
-        axis, _knee_angle(hip.pos - longer[0], longer[1] - longer[0], axis, wanted)
+        axis, _knee_angle(hip.pos - long_knee, long_ankle - long_knee, axis, wanted)
     )
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
     hip_rot = _hip_rotation(bent - hip.pos, target - hip.pos, axis, leg["leg.twist"])
