@@ -7,6 +7,7 @@ references.
 """
 
 import dataclasses
+import functools
 import math
 
 from jaxik.pipeline import FootIK
@@ -37,9 +38,11 @@ from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
 # For locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing.
-SLOPES = {"max_pitch": 0.8, "min_pitch": -1.0, "max_roll": 0.45, "min_roll": -0.6}
-"""Limits of feet, rad, within which soles lie on slopes of 25 degrees."""
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
+SlopeFoot = functools.partial(
+    PitchRollFoot, max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6
+)
+"""A foot with limits, rad, within which its sole lies on slopes of 25 degrees."""
 
 
 def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
@@ -94,7 +97,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             separation=FootSeparation(),
             pelvis=LowestPelvis(wait_to_rise=True, min_extension=0.36),
             leg=TwoBone(as_animated=True),
-            foot=PitchRollFoot(**SLOPES),
+            foot=SlopeFoot(),
         )
     return body.scale(ik, rig)
 
@@ -237,7 +240,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         pelvis=ReachPelvis(rise_half_life=0.08, fall_half_life=0.03, spring=True),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
-        foot=PitchRollFoot(**SLOPES),
+        foot=SlopeFoot(),
         fade=SpeedFade(),
     )
     return body.scale(ik, rig)
