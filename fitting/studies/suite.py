@@ -352,70 +352,86 @@ SITUATIONS = (
 
 
 class Limitation(NamedTuple):
-    """What a preset cannot do, with its reason."""
+    """What a preset cannot do with its defaults, and why."""
 
     preset: str
     situations: str
-    """Names, separated by commas; all, if empty."""
+    """Names, separated by commas."""
     measures: str
     """Names, separated by spaces."""
     reason: str
 
+    def covers(self, system: str, situation: str, measure: str) -> bool:
+        """Whether it is about this measure of this system in this situation."""
+        return (
+            system == self.preset
+            and situation in self.situations.split(", ")
+            and measure in self.measures.split()
+        )
+
 
 STAIRS = "stairs up, stairs down, leaning stairs up, leaning stairs down"
+SLOPES = "hill, slope along"
+WALKS = f"{STAIRS}, {SLOPES}, slope across, rubble, curb, turn in place, giant, child"
 LIMITATIONS = (
     Limitation(
         "record", f"{STAIRS}, curb", "penetration contact pop pelvis_jerk reached",
         "its original casts one ray under each foot, which meets a step once it is over it",
     ),
     Limitation(
-        "record", "hill, slope along", "penetration contact slide pelvis_jerk reached",
+        "record", SLOPES, "penetration contact slide pelvis_jerk reached",
         "its original lowers the body to the lowest standing foot, whatever the legs reach",
     ),
     Limitation(
         "record", "carried idle", "foot_skating",
-        "its original locks feet that nobody steps with; they go back once they are let go",
+        "its original locks feet with which nobody steps; they go back once they are let go",
     ),
     Limitation(
-        "ozz", f"{STAIRS}, curb, planks", "penetration contact reached",
-        "its original has each foot on the ground below it, also in mid-swing before a step",
-    ),
-    Limitation(
-        "ozz", "", "slide foot_skating pop pelvis_jerk",
+        "ozz", f"{WALKS}, flat walk, flat run, planks, room, higher floor, elevator, train, jump, "
+        "teleport", "slide foot_skating pop pelvis_jerk",
         "its original lays all soles flat on the ground, at once and without memory",
     ),
     Limitation(
-        "unreal", "", "penetration contact pop pelvis_jerk reached",
-        "its original works only while the character stands, and its latch may freeze the pelvis",
+        "ozz", "stairs up, leaning stairs up, curb", "penetration contact",
+        "its original has each foot on the ground below it, also in mid-swing before a step",
+    ),
+    Limitation(
+        "unreal", f"{WALKS}, planks, jump, squat on a block, squat on a slope",
+        "penetration contact pop pelvis_jerk",
+        "its original works only while the character stands, and a moving pelvis is motion",
+    ),
+    Limitation(
+        "unreal", "dip", "penetration contact",
+        "the latch of its original freezes the pelvis short of its goal",
+    ),
+    Limitation(
+        "mec", WALKS, "penetration contact pop pelvis_jerk reached",
+        "its original leaves feet as animated unless they are low and slow, and the body with them",
     ),
     Limitation(
         "mec", "planks", "penetration contact slide pop pelvis_jerk reached",
         "the rays of its original fall through gaps",
     ),
     Limitation(
-        "mec", "", "penetration contact pop pelvis_jerk reached",
-        "its original leaves feet as animated unless they are low and slow, and the body with them",
-    ),
-    Limitation(
         "mec", "carried idle", "foot_skating",
-        "its original plants feet that nobody steps with; they go back once they are let go",
+        "its original plants feet with which nobody steps; they go back once they are let go",
     ),
     Limitation(
-        "stride", f"{STAIRS}, hill, slope along", "pop pelvis_jerk",
+        "stride", f"{STAIRS}, {SLOPES}", "pelvis_jerk",
+        "its pelvis sinks as fast as a trailing leg gets too long",
+    ),
+    Limitation(
+        "stride", "leaning stairs up, leaning stairs down", "pop",
         "its pelvis sinks as fast as a trailing leg gets too long",
     ),
 )  # fmt: skip
-"""What the presets miss with their defaults."""
+"""What the presets miss."""
 
 
 def reason_of(system: str, situation: str, measure: str) -> str | None:
     """Why a preset misses a bound in a situation; None where that is not known."""
-    for limitation in LIMITATIONS:
-        names = [name.strip() for name in limitation.situations.split(",") if name]
-        there = not names or situation in names
-        if system == limitation.preset and there and measure in limitation.measures.split():
-            return limitation.reason
-    return None
+    miss = system, situation, measure
+    return next((entry.reason for entry in LIMITATIONS if entry.covers(*miss)), None)
 
 
 def choose(only: str | None = None, *, quick: bool = False) -> Plan:

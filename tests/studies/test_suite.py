@@ -219,14 +219,20 @@ def test_what_is_within_its_bounds_stays_so(chosen, names):
         for bounded in scene.beyond(name)
     }
     assert not {key: words for key, words in misses.items() if not suite.reason_of(*key)}
+    if chosen.situations == suite.SITUATIONS:
+        unused = [x for x in suite.LIMITATIONS if not any(x.covers(*key) for key in misses)]
+        assert not unused
 
 
-def test_reasons_are_of_presets_situations_and_measures_that_exist_and_stand_beside_misses():
+def test_reasons_are_of_presets_situations_and_measures_that_exist_and_stand_beside_misses(still):
     situations = {entry.name for entry in suite.SITUATIONS}
     for limitation in suite.LIMITATIONS:
-        names = limitation.situations.split(",")
         assert limitation.preset in preset_names() and limitation.reason
-        assert {name.strip() for name in names if name} <= situations
+        assert set(limitation.situations.split(", ")) <= situations
         assert set(limitation.measures.split()) <= set(BOUNDED)
     assert suite.reason_of("record", "curb", "pop") and not suite.reason_of("record", "room", "pop")
-    assert suite.reason_of("ozz", "room", "slide") and not suite.reason_of("mine", "room", "slide")
+    finished = run_situations(lambda rig: {"unreal": still, "mine": still}, plan("stairs up"))
+    reason = suite.reason_of("unreal", "stairs up", "penetration")
+    (scene,) = finished.scenes
+    assert reason and any(words.endswith(reason) for words in suite.misses(scene, "unreal"))
+    assert not any(reason in words for words in suite.misses(scene, "mine"))
