@@ -314,7 +314,13 @@ def draft(
         ValueError: a file cannot be read.
     """
     entries = tuple(_entry(request, clips[i], i, ground) for i, ground in enumerate(grounds))
-    preset, fast = request.preset_for(clips), any(clip.fps > FAST for clip in clips)
+    fps = SLOW if any(clip.fps > FAST for clip in clips) else None
+    with activity.announced("Reading the clips and their ground"):
+        data = [
+            load_clip_data(entry, fps, has_file=False, captured=clip)
+            for entry, clip in zip(entries, clips, strict=True)
+        ]
+    preset = request.preset_for(clips)
     experiment = Experiment(
         path=folder / EXPERIMENT,
         clips=entries,
@@ -322,14 +328,9 @@ def draft(
         preset=preset.name,
         faithful=preset.faithful,
         name=folder.resolve().name,
-        fps=SLOW if fast else None,
+        fps=fps,
         record_only=request.record_only,
     )
-    with activity.announced("Reading the clips and their ground"):
-        data = [
-            load_clip_data(entry, experiment.fps, has_file=False, captured=clip)
-            for entry, clip in zip(entries, clips, strict=True)
-        ]
     rig = data[0].base.rig
     ik = experiment.starting_system(rig)
     candidates = {

@@ -131,15 +131,15 @@ def test_no_pair_of_legs_or_two_possible_ones_are_refused_with_the_names_of_join
 
 def test_the_trunk_is_the_way_from_the_pelvis_to_the_head():
     for names, parents, trunk in (
-        ("Hips LowerBack Spine Neck Head", (-1, 0, 1, 2, 3), Trunk(1, 4)),
-        ("hip abdomen chest neck head", (-1, 0, 1, 2, 3), Trunk(1, 4)),
-        ("Root Pelvis mixamorig:Spine mixamorig:Head", (-1, 0, 1, 2), Trunk(2, 3)),
-        ("Root Pelvis Waist Head", (-1, 0, 0, 2), Trunk(2, 3)),  # legs and spine side by side
-        ("pelvis spine_01 neck_01", (-1, 0, 1), Trunk(1, None)),
+        ("Hips LowerBack Spine Neck Head", (-1, 0, 1, 2, 3), Trunk(1, 4, (1, 2, 3))),
+        ("hip abdomen chest neck head", (-1, 0, 1, 2, 3), Trunk(1, 4, (1, 2, 3))),
+        ("Root Pelvis mixamorig:Spine mixamorig:Head", (-1, 0, 1, 2), Trunk(2, 3, (2,))),
+        ("Root Pelvis Waist Head", (-1, 0, 0, 2), Trunk(2, 3, (2,))),  # legs and spine side by side
+        ("pelvis spine_01 neck_01", (-1, 0, 1), Trunk(1, None, (1,))),
         ("Hips Head", (-1, 0), Trunk(None, 1)),
         ("pelvis left_hip", (-1, 0), Trunk(None, None)),
-        ("Bip01_Pelvis Bip01_Spine Bip01_Neck Bip01_Head", (-1, 0, 1, 2), Trunk(1, 3)),
-        ("DEF-spine DEF-spine.001 x y", (-1, 0, 1, 2), Trunk(1, None)),
+        ("Bip01_Pelvis Bip01_Spine Bip01_Neck Bip01_Head", (-1, 0, 1, 2), Trunk(1, 3, (1, 2))),
+        ("DEF-spine DEF-spine.001 x y", (-1, 0, 1, 2), Trunk(1, None, (1,))),
     ):
         assert find_trunk(tuple(names.split()), parents, int(names.startswith("Root"))) == trunk
 

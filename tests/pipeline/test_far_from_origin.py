@@ -105,8 +105,10 @@ def test_a_walk_far_away_is_the_walk_at_the_origin(preset: str, sails: bool):
         assert result.pose.ankle.pos.dtype == np.float32
         if sails:
             assert (np.asarray(result.trace.sensed.ground.ankle.platform) == 0).mean() > 0.5
-        for part in ("pose", "body", "corrections"):
-            assert_close(getattr(result, part), getattr(expected, part), EXACT)
+        # Almost straight legs turn by a root of how far their targets are, and mec stretches them.
+        angles = 10.0 * EXACT if preset == "mec" else EXACT
+        for part, tolerance in (("pose", angles), ("body", EXACT), ("corrections", angles)):
+            assert_close(getattr(result, part), getattr(expected, part), tolerance)
 
 
 def test_a_trace_is_in_world_space_and_memory_about_its_centre():

@@ -60,7 +60,7 @@ def foreseen(
     state = jaxik.init(ik, to_rig(RIG))
     if memory is not None:
         state = dataclasses.replace(state, started=jnp.ones((), bool), probe=memory)
-    return Clip(ik, inputs, state, None, {}).ahead("probe", watch, contacts)
+    return Clip(ik, inputs, state, None, {}).ahead("probe", watch, contacts, None)
 
 
 def test_nothing_changes_on_a_flat_floor():

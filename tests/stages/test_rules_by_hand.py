@@ -144,8 +144,7 @@ def test_a_foothold_covers_half_its_way_in_a_half_life_up_and_down():
     """
     foothold = fragment(
         Foothold,
-        point_ws=jnp.asarray(ZEROS),
-        height=jnp.array([0.2, 0.1]),
+        point_ws=jnp.array([0.2, 0.1])[:, None] * UP,
         ankle_height_ms=jnp.full(2, 0.1),
         climb=jnp.ones(2),
         lift=jnp.array([0.08, 0.10]),

@@ -40,7 +40,7 @@ def roots(**base: Any) -> tuple[Case, ...]:
         # Nearer to a bend, the smoother root begins to rise.
         forward("root.half_life", (0.3, 0.8), "+ root height", RAMP_UP),
         forward("root.max_speed", (0.05, 0.1), "+ root height", RAMP_UP),
-        forward("root.max_step", (0.1, 0.6), "+ root height", CLIFF),
+        forward("root.max_step", (0.1, 0.3), "+ root height", CLIFF, slope=False),
     )
 
 

@@ -100,7 +100,7 @@ def test_the_command_says_what_it_assumes(drafted):
     text = drafted[1]
     assert "legs 0.8" in text and "the left knee bends by" in text
     assert re.search(r"ground +below 100% of the stances; soles stand", text)
-    assert "free: 1 of 55 parameters" in text and "now: jaxik fit" in text
+    assert "free: 1 of 62 parameters" in text and "now: jaxik fit" in text
 
 
 def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monkeypatch, capsys):
