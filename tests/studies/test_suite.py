@@ -203,7 +203,8 @@ def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
 @pytest.mark.parametrize(
     ("chosen", "names"),
     [
-        (plan(*FEW), ["stride"]),
+        # Longer: swings that the end cuts off as they begin may pop on stairs.
+        (plan(*FEW)._replace(seconds=2.5), ["stride"]),
         pytest.param(suite.choose(), preset_names(), marks=pytest.mark.slow),
     ],
     ids=["for a while", "at length"],
