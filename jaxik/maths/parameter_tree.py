@@ -132,9 +132,9 @@ def as_layers(x: ArrayLike) -> Array:
 
 
 def parameter(
-    default: float | tuple[float, ...],
-    low: float,
-    high: float,
+    default: int | float | tuple[int | float, ...],
+    low: int | float,
+    high: int | float,
     doc: str,
     *,
     unit: str,
@@ -180,17 +180,17 @@ ratio = functools.partial(parameter, unit="1")
 threshold = functools.partial(parameter, kind="threshold")
 
 
-def half_life(default: float, doc: str) -> Declared:
+def half_life(default: int | float, doc: str) -> Declared:
     """Declares a half-life, s: fitted by factors from 2 ms to 0.5 s; at 0 memory jumps."""
     return parameter(default, 0.002, 0.5, doc, unit="s", scale="log")
 
 
-def gain_per_tick(default: float, doc: str) -> Declared:
+def gain_per_tick(default: int | float, doc: str) -> Declared:
     """Declares a gain per tick, 0..1: fitted as its half-life; at 1 memory jumps."""
     return parameter(default, 0.01, 0.95, doc, unit="1/tick", scale="gain")
 
 
-def constant(default: float, doc: str, *, unit: str) -> Declared:
+def constant(default: int | float, doc: str, *, unit: str) -> Declared:
     """Declares a float field of a rule that is a convention, such as a tick rate: never fitted."""
     metadata = {"unit": unit, "doc": doc, "follows": BY_UNIT.get(unit, "nothing")}
     return _field(default, as_float_array, metadata)
