@@ -91,7 +91,7 @@ DRAGGED = {
     # Feet without memory are at once where the ground is.
     "ozz": Motion(pop=0.18, body=0.18, far=0.25),
     "unreal": NOTICED,
-    "mec": NOTICED._replace(far=0.25),
+    "mec": NOTICED._replace(far=0.25, pop=0.03),  # its legs stretch before they let go
 }
 """m, where the animation drags feet over the sides of terraces."""
 
