@@ -355,7 +355,7 @@ def test_a_restricted_experiment_is_the_same_when_read_again_or_refused_if_it_co
 
 def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkeypatch):
     rest = "[start]\nfoot.max_pitch = 0.5\ntarget.rise_half_life = 0.1"
-    clip = "start = 1.0\nend = 1.2"
+    clip = "start = 1.0\nend = 1.5"
     free = 'foot.max_pitch = {}\n"probe.toe_ls[1]" = {}\ntarget.rise_half_life = {}\n'
     experiment = restricted(tmp_path, rest=rest, free=free, clips=CLIP + clip)
     problem = make_problem(experiment)

@@ -365,11 +365,11 @@ def test_a_long_clip_has_fewer_frames_and_many_grounds_are_coarser(fitted, motio
     shown = fit_report.viewed_clip(motions, "captured", worst_window.find_worst_window(play))
     (whole,) = motion_data.pack([shown])
     assert motion_data.steps_between_frames([shown]) == [1]  # 30 Hz
-    assert motion_data.steps_between_frames([shown], -1) == [8]  # one frame of seven is left
+    assert motion_data.steps_between_frames([shown], -1) == [16]  # one frame of sixteen is left
     monkeypatch.setattr(motion_data, "MAX_RATE", 15.0)
     assert motion_data.steps_between_frames([shown]) == [2]
     ground = 2 * motions.ground.heights.size
-    spent = motion_data.MAX_BYTES - ground - 600  # by pictures
+    spent = motion_data.MAX_BYTES - ground - 1400  # by pictures
     (packed,) = motion_data.pack([shown], spent)
     step = -(-whole["frames"] // packed["frames"])
     assert step > 2, "grounds and pictures count"

@@ -26,7 +26,7 @@ NAMES = ("pelvis.on_gain", "foot.max_pitch")
 def invented_fit(folder: Path, more: str = "") -> Fit:
     """A fit with invented numbers; its experiment, with more tables, is written to the folder."""
     rest = f"[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false\n{more}"
-    path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.2")
+    path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.5")
     experiment = experiment_files.load_experiment(path)
     problem = problems.make_problem(experiment)
     u = np.array([0.3, -0.2])
