@@ -483,6 +483,7 @@ def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     assert not any(eqx.tree_equal(ik, other) for other in dragged)
 
 
+@pytest.mark.slow
 def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, legs, tmp_path, monkeypatch):
     monkeypatch.setattr(
         benchmarks, "run_character", lambda ik, rig, ground, motion: 2 * motion.weight

@@ -31,7 +31,7 @@ BORDER = np.array([0.0, 0.0, 0.5 * LATTICE - 1.0])
 HILL = grounds.hill()
 PRESETS = [  # and whether the hill is a ship; `ozz` and `unreal` have no memory that these have not
     ("record", False),
-    ("mec", True),
+    pytest.param("mec", True, marks=pytest.mark.slow),
     pytest.param("stride", False, marks=pytest.mark.slow),
 ]
 

@@ -98,7 +98,8 @@ def pair(first: Transform, second: Transform) -> Transform:
     return jax.tree.map(lambda *x: jnp.stack(x, axis=1), first, second)
 
 
-@pytest.mark.parametrize("preset", ["mec", pytest.param("record", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", SYSTEMS)
 def test_a_walk_on_moving_ground_is_the_walk_on_ground_that_stands(preset: str):
     """By Galileo, feet on a belt and on the floor do not know, either, which of them moves."""
     stands, belt = MOTIONS["stands"], track(line(x=0.04 * TIME, z=0.2 * TIME), 0 * TIME)

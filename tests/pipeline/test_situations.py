@@ -18,7 +18,7 @@ from support.cases import QUICK
 from support.clips import to_frames, to_rig
 
 FRAMES, HZ = 120, 60.0
-GAMES = ("ozz", "unreal", "mec")
+GAMES = (pytest.param("ozz", marks=pytest.mark.slow), "unreal", "mec")  # with roots of their own
 TOES = standing()[0, 2] + 0.12  # m, ahead of the root
 APART = 20.0  # m, from the middle of one place to that of the next
 

@@ -209,6 +209,7 @@ def assert_alike(path: Path, expected: dict[str, np.ndarray]) -> None:
             np.testing.assert_allclose(archive[name], values, rtol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_eight_devices_find_what_one_finds(evaluations, tmp_path):
     process = start(tmp_path / "eight.npz", 8)
     _, errors = process.communicate(timeout=500)

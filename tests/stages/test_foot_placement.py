@@ -327,7 +327,11 @@ def grounds(probe, simple, frames, weight):
 
 
 @pytest.mark.parametrize(
-    "probe", [FootProbe(layers=COMPLEX), StrideProbe(layers=COMPLEX)], ids=["foot", "stride"]
+    "probe",
+    [
+        pytest.param(FootProbe(layers=COMPLEX), id="foot"),
+        pytest.param(StrideProbe(layers=COMPLEX), id="stride", marks=pytest.mark.slow),
+    ],
 )
 def test_feet_in_flight_see_simple_ground_and_standing_feet_the_other(probe):
     frames = clip("walks" if isinstance(probe, StrideProbe) else "goes forward")

@@ -234,7 +234,7 @@ def test_all_numbers_switches_and_masks_have_a_case(name: str):
     assert {case.leaf for case in CASES[name]} == expected
 
 
-@pytest.mark.parametrize("name", ["record", "stride", "by speed"])
+@pytest.mark.parametrize("name", ["record", STRIDE, "by speed"])
 def test_each_leaf_has_the_expected_effect(name: str):
     if name != "record":  # whose derivatives are quick
         by_value = cases.outcomes_of(CASES[name], cases.system(name), sloped=False)

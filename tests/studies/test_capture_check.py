@@ -92,6 +92,7 @@ def test_the_flat_animation_of_a_clip_on_flat_ground_is_the_clip_itself():
     assert np.ptp(stairs.positions_ws[:, walk.rig.pelvis, 1]) < 1e-12
 
 
+@pytest.mark.slow
 def test_what_a_preset_does_to_flat_clips_is_said_and_what_stops_it_is_free(
     tmp_path, floor, capsys
 ):
