@@ -129,6 +129,7 @@ def test_after_a_restart_nothing_is_remembered():
     assert np.abs(remembered - there.pose.ankle.pos).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_clip_in_blocks_of_checked_frames_equals_the_clip_as_a_whole():
     """Nothing is looked at in checked frames, so that none is faulty whatever it holds."""
     awake = {"contact.idle_speed": 10.0, "effector.latch": False}
