@@ -162,20 +162,21 @@ def _stride(
 ) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; unknown where a foot will not stand any more.
 
-    A swing that the end cuts off goes as far as the one before it, and takes as long.
+    A swing that the end cuts off goes as far as a whole one before it, and takes as long.
     """
     known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
     last_ws, next_ws, aside_ws = (np.zeros(balls.shape) for _ in range(3))
     fraction = np.zeros(stance.shape)
-    for leg in np.flatnonzero(stance.any(axis=0)):
+    for leg in map(int, np.flatnonzero(stance.any(axis=0))):
         falls = contacts.footfalls(balls[:, leg], stance[:, leg], up_ws)
         last_ws[:, leg] = falls.positions_ws[falls.last]
         next_ws[:, leg] = falls.positions_ws[falls.next]
         fraction[:, leg] = falls.swing_fraction
         aside_ws[:, leg] = falls.aside_ws[falls.last]
-        backward = contacts.cut_off_swing(balls[::-1, leg], stance[::-1, leg], up_ws)
+        backward = contacts.cut_off_swing(balls[::-1], stance[::-1], leg, up_ws)
         if backward is not None:
-            next_ws[falls.last == falls.last[-1], leg] = backward.last_ws
+            landed = contacts.runs(stance[:, leg])[-1][0]
+            next_ws[landed:, leg] = backward.last_ws
             fraction[-len(backward.fraction) :, leg] = 1.0 - backward.fraction[::-1]
             known[:, leg] = True
     return stance, last_ws, next_ws, fraction, known, aside_ws

@@ -164,32 +164,44 @@ class CutOffSwing:
 
 
 def cut_off_swing(
-    ball_ws: Float64[np.ndarray, "frames 3"],
-    stance: Bool[np.ndarray, " frames"],
+    balls_ws: Float64[np.ndarray, "frames legs 3"],
+    stance: Bool[np.ndarray, "frames legs"],
+    leg: int,
     up_ws: Sequence[float] | np.ndarray = UP,
 ) -> CutOffSwing | None:
-    """The swing of one foot that the start of a clip cuts off, as long and far as its next one.
+    """The swing of a foot that the start of a clip cuts off, as long and far as its next one.
 
-    None if there is none, or no whole one. That of the clip reversed is the one that its end cuts
-    off, with its footholds exchanged.
+    If a foot stands only once, the first whole swing of another foot counts. None if there is none,
+    or nothing is cut off. That of the clip reversed is the one that its end cuts off, with its
+    footholds exchanged.
 
     Args:
-        ball_ws: position of the foot's ball, m.
-        stance: True where it stands.
+        balls_ws: position of the ball of each foot, m.
+        stance: True where they stand.
+        leg: number of the foot.
         up_ws: unit, of the floor.
     """
-    stances = runs(stance)
-    if len(stances) < 2 or stances[0][0] == 0:
+    stances = [runs(of_foot) for of_foot in stance.T]
+    if not stances[leg] or stances[leg][0][0] == 0:
         return None
-    landing, arriving = stances[0][0], stances[1][0]
-    next_ws, following_ws = (np.median(ball_ws[a : b + 1], axis=0) for a, b in stances[:2])
-    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), up_ws)
+    swings = [(other != leg, of[0][1], other) for other, of in enumerate(stances) if len(of) > 1]
+    if not swings:
+        return None
+    landing, (_, leaving, example) = stances[leg][0][0], min(swings)
+    arriving = stances[example][1][0]
+
+    def place(foot: int, index: int) -> Float64[np.ndarray, "3"]:
+        first, last = stances[foot][index]
+        return np.median(balls_ws[first : last + 1, foot], axis=0)
+
+    next_ws, example_ws = place(leg, 0), place(example, 1) - place(example, 0)
+    remaining, way = _level(np.stack([next_ws - balls_ws[0, leg], example_ws]), up_ws)
     lengths = np.linalg.norm([remaining, way], axis=1)
     # What little is seen of a swing that is nearly all cut off tells its direction badly.
     hidden = max(0.0, 1.0 - lengths[0] / max(lengths[1], SHORTEST_WAY))
     ahead = remaining + hidden * way
     back = ahead / max(float(np.linalg.norm(ahead)), 1e-9) * lengths.max()
-    fraction = 1.0 - (landing - np.arange(landing)) / (arriving - stances[0][1])
+    fraction = 1.0 - (landing - np.arange(landing)) / (arriving - leaving)
     return CutOffSwing(next_ws - back, next_ws, np.maximum(fraction, 0.0))
 
 

@@ -316,7 +316,7 @@ def with_cut_off_swings(frames: jaxik.Frame, clip: Clip, terrain: Terrain) -> ja
         (slice(piece.start, piece.start + len(swing.fraction)), leg, swing)
         for piece in clip.pieces
         for leg in range(stance.shape[1])
-        if (swing := contacts.cut_off_swing(balls_ws[piece, leg], stance[piece, leg])) is not None
+        if (swing := contacts.cut_off_swing(balls_ws[piece], stance[piece], leg)) is not None
     ]
     if not swings:
         return frames

@@ -274,37 +274,42 @@ def test_a_swing_that_is_cut_off_begins_where_the_whole_clip_shows_it(walk):
     expected = np.median(walk.joints_ws(3)[first : last + 1, LEG], axis=0)
     for part in (0.05, 0.3, 0.6, 0.95):
         clip = cut(walk, part)
-        cut_off = contacts.cut_off_swing(clip.joints_ws(3)[:, LEG], clip.stance_labels()[:, LEG])
+        cut_off = contacts.cut_off_swing(clip.joints_ws(3), clip.stance_labels(), LEG)
         assert cut_off is not None, part
         np.testing.assert_allclose(cut_off.last_ws[[0, 2]], expected[[0, 2]], atol=0.06)
         frames = np.arange(walk.frame_count - clip.frame_count, landing)
         fraction, frame = (frames - leaving) / (landing - leaving), 1 / (landing - leaving)
         np.testing.assert_allclose(cut_off.fraction, fraction, atol=2 * frame)
     clip = cut(walk, 0.5)
-    balls_ws, stance = clip.joints_ws(3)[:, LEG], clip.stance_labels()[:, LEG]
-    first, last = contacts.runs(stance)[0]
-    for frames in (slice(first, None), slice(last + 5), slice(first)):
-        # It starts standing, or lands once, or never.
-        assert contacts.cut_off_swing(balls_ws[frames], stance[frames]) is None
+    balls_ws, stance = clip.joints_ws(3), clip.stance_labels()
+    first, last = contacts.runs(stance[:, LEG])[0]
+    for frames in (slice(first, None), slice(last), slice(first)):
+        # It starts standing, or no foot has a whole swing, or it never lands.
+        assert contacts.cut_off_swing(balls_ws[frames], stance[frames], LEG) is None
 
 
 def test_a_swing_that_the_end_cuts_off_goes_on_as_in_the_whole_clip(walk):
     leaving, landing = swing_of(walk)
     whole = clip_frames.frames_from_clip(walk).stride
-    for part in (0.05, 0.3, 0.6, 0.95):
+    # In a clip that starts here the foot stands once, and the other one has the whole swing.
+    once = contacts.runs(walk.stance_labels()[:, LEG])[3][0] - 5
+    for start, part in ((0, 0.05), (0, 0.3), (0, 0.6), (0, 0.95), (once, 0.2), (once, 0.95)):
         end = round(leaving + part * (landing - leaving)) + 1
-        stride = clip_frames.frames_from_clip(walk.select(np.arange(end))).stride
+        stride = clip_frames.frames_from_clip(walk.select(np.arange(start, end))).stride
         np.testing.assert_array_equal(stride.known[:, LEG], 1.0)
         for name, near in (
             ("last_ws", 0.0),
             ("next_ws", 0.06),
             ("fraction", 2 / (landing - leaving)),
         ):
-            expected, actual = (getattr(x, name)[leaving - 5 : end, LEG] for x in (whole, stride))
+            expected = getattr(whole, name)[leaving - 5 : end, LEG]
+            actual = getattr(stride, name)[leaving - 5 - start :, LEG]
             np.testing.assert_allclose(actual, expected, rtol=0, atol=near + 1e-9, err_msg=name)
+        expected = whole.next_ws[start : start + 5, LEG]  # also of a swing that the start cuts off
+        np.testing.assert_array_equal(stride.next_ws[:5, LEG], expected)
     first, last = contacts.runs(walk.stance_labels()[:, LEG])[0]
-    for frames, known in ((np.arange(last + 5), last), (np.arange(first), -1)):
-        # No swing before it says how long and far one goes, or the foot never stands.
+    for frames, known in ((np.arange(last + 2), last), (np.arange(first), -1)):
+        # No whole swing says how long and far one goes, or the foot never stands.
         stride = clip_frames.frames_from_clip(walk.select(frames)).stride
         np.testing.assert_array_equal(stride.known[:, LEG], frames <= known)
 
