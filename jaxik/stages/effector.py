@@ -17,7 +17,7 @@ from jaxik.maths.parameter_tree import (
     threshold,
 )
 from jaxik.maths.struct import place, struct
-from jaxik.world.frame import Sensed, counted
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import SensedMoment
@@ -27,6 +27,7 @@ HEIGHT_BAND = 0.01  # m
 ANGLE_BAND = 0.035  # rad, 2 degrees
 # Sine of the angle by which a leg points ahead, up to which its heel rises and from which it stays.
 RISES, STAYS = 0.0, 0.3
+AWAITED = 0.1  # weight of a leg, from which the latch waits for its foot
 SHORTENS = 0.3  # of the most that a rising heel can shorten a leg, from which it counts in full
 
 
@@ -220,7 +221,7 @@ class BodyEffector(AbstractEffector):
         height = smoothing.lerp(state.height, goal, fraction)
 
         near = now.gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
-        arrived = jnp.prod(1.0 - counted(sensed.weight) * (1.0 - near))
+        arrived = jnp.prod(1.0 - _awaited(sensed) * (1.0 - near))
         may_sleep = jnp.where(self.latch, self._stands(now), 0.0)
         asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
@@ -233,8 +234,13 @@ class BodyEffector(AbstractEffector):
     def _stands(self, now: SensedMoment) -> Float[Array, ""]:
         """1 while all feet with foot IK stand."""
         sensed = now.sensed
-        standing = 1.0 - counted(sensed.weight) * (1.0 - sensed.contact.planted)
+        standing = 1.0 - _awaited(sensed) * (1.0 - sensed.contact.planted)
         return now.gate.minimum(standing, band=0.1)
+
+
+def _awaited(sensed: Sensed) -> Float[Array, " legs"]:
+    """0..1, how far the latch waits for each foot: a decision about when, not about how far."""
+    return smoothing.clip_to_one(sensed.weight / AWAITED)
 
 
 @struct

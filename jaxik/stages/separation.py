@@ -102,7 +102,7 @@ class FootSeparation(AbstractSeparation):
         missing = wanted - _apart(placed, placed + kept, side)
         zero = jnp.zeros_like(missing)
         missing = now.gate.clip(missing, zero, zero + jnp.inf, band=DISTANCE_BAND)
-        active = sensed.counted
+        active = sensed.load
         free = 1.0 - held
         moves = active * free  # so that a foot with hardly any weight hardly gives way
         share = vec.safe_divide(moves[:, None], free[:, None] + moves[None, :])

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, angle, duration, ratio
-from jaxik.maths.smoothing import fraction_of_half_life, lerp
-from jaxik.world.frame import UP, Frame, counted, heading
+from jaxik.maths.smoothing import clip_to_one, fraction_of_half_life, lerp
+from jaxik.world.frame import UP, Frame, heading
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import Inputs, Moment
@@ -76,7 +76,7 @@ class StrideWarp(Rule):
         turn = jnp.where(turn < -RIGHT_ANGLE, -jnp.pi - turn, turn)
         turn = inputs.gate.clip(turn, -self.max_angle, self.max_angle, band=ANGLE_BAND)
         weight = vec.sum_last(jnp.where(inputs.rig.present, frame.weight, 0.0))
-        return turn * frame.grounded * counted(weight)
+        return turn * frame.grounded * clip_to_one(weight)
 
     def advance(
         self, now: Moment, goal: Float[Array, ""] | None, state: Float[Array, ""]

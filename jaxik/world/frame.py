@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from jaxik.maths import quat, vec
-from jaxik.maths.smoothing import clip_to_one, smoothstep
+from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import place, struct
 
 from .skeleton import LegPose, Rig, Still, Transform
@@ -14,7 +14,6 @@ from .terrain import Hit
 
 FORWARD = (0.0, 0.0, 1.0)  # model space
 UP = (0.0, 1.0, 0.0)  # model space
-COUNTS = 0.1  # weight, of a leg or of all, from which it counts in full for what moves the body
 # Cosines between the ups of a leg and of the body from which the leg bears, and bears in full.
 LEAST_BEARING, FULL_BEARING = 0.3, 0.7
 
@@ -265,11 +264,6 @@ class Sensed:
         return self.weight * self.bearing
 
     @property
-    def counted(self) -> Float[Array, " legs"]:
-        """0..1, how far each leg counts for what moves the body, whatever its load is then."""
-        return counted(self.load)
-
-    @property
     def unscaled_ankle_ws(self) -> Float[Array, "legs 3"]:
         """m, the animated ankles before strides are scaled and turned."""
         return self.ankle_ws if self.warp_ws is None else self.ankle_ws - self.warp_ws
@@ -284,11 +278,6 @@ class Sensed:
         """0..1, how far each foot turns to the ground under it."""
         standing = self.contact.weight
         return self.ground.ankle.found * (standing + self.ground.swing * (1.0 - standing))
-
-
-def counted(weight: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """0..1, how far what has this weight counts: nothing changes as soon as there is some."""
-    return clip_to_one(weight / COUNTS)
 
 
 def bearing(leg_up_ws: Float[Array, "*legs 3"], up_ws: Float[Array, "3"]) -> Float[Array, "*legs"]:

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import HARD
 from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs, SensedMoment
-from jaxik.world.frame import Contact, GroundHits, Slope, counted, heading
+from jaxik.world.frame import Contact, GroundHits, Slope, heading
 from jaxik.world.skeleton import Rig
 
 
@@ -90,10 +91,10 @@ def standing_slope(inputs: Inputs, ground: GroundHits, contact: Contact, weight:
     standing = stands * weight
     normal = vec.sum_vectors(vec.scale(ground.ankle.normal, standing))
     total = vec.sum_last(standing)
-    normal = jnp.where(total > 0, normal, up_ws)
+    normal = vec.scale(normal, vec.safe_divide(jnp.ones_like(total), total))
+    most = HARD.maximum(stands, band=0.0)
     # Not as soon as a leg that stands has any weight at all.
-    level = 1.0 - counted(vec.safe_divide(total, vec.sum_last(stands)))
-    normal += vec.scale(up_ws - normal, level)
+    normal = smoothing.lerp(up_ws, normal, smoothing.clip_to_one(vec.safe_divide(total, most)))
     up = vec.dot(normal, up_ws)
     return Slope(
         vec.safe_arctan2(-vec.dot(normal, forward_ws), up),

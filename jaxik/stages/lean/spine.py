@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life, length, ratio, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
-from jaxik.world.frame import Contact, GroundHits, Slope, counted
+from jaxik.world.frame import Contact, GroundHits, Slope
 from jaxik.world.skeleton import Rig
 
 from .base import (
@@ -22,6 +22,7 @@ from .base import (
 )
 
 SLOPE_BAND = 0.05  # rad
+LITTLE = 0.1  # of a foot's ground, from which its slope counts in full
 
 
 class SpineLean(AbstractLean):
@@ -95,9 +96,14 @@ class SpineLean(AbstractLean):
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         soles = standing_slope(inputs, ground, contact, weight)
-        weight = weight * ground.ankle.found * inputs.bearing
-        sure = counted(vec.sum_last(contact.weight * weight))
-        known = counted(vec.sum_last(weight))
+        load = weight * inputs.bearing
+        found = jnp.where(inputs.rig.present, ground.ankle.found * inputs.bearing, 0.0)
+        sure = _known(contact.weight * found)
+        # A line takes two legs: with one of hardly any load, it hardly counts.
+        total = vec.sum_last(load)
+        pairs = 0.5 * (total * total - vec.sum_last(load * load))
+        known = _known(found) * smoothing.clip_to_one(pairs)
+        weight = weight * found
         weight = vec.safe_divide(weight, vec.sum_last(weight))
         points = ground.ankle.point - inputs.frame.world_from_model.pos
         height = self._about_mean(points, inputs.terrain.up_ws, weight)
@@ -142,3 +148,8 @@ class SpineLean(AbstractLean):
         )
         spine = quat.multiply(trunk, quat.conjugate(pelvis))
         return after, Lean(pelvis, ground_normal(now, after), spine, head)
+
+
+def _known(ground: Array) -> Float[Array, ""]:
+    """0..1, whether there is ground under feet: all of it as soon as there is a little."""
+    return smoothing.clip_to_one(vec.sum_last(ground) / LITTLE)

@@ -1,5 +1,6 @@
 """What pelvis rules share: their memory, what they are given, and how high feet want the body."""
 
+import itertools
 from abc import abstractmethod
 from typing import ClassVar
 
@@ -17,7 +18,6 @@ from jaxik.world.skeleton import Rig, Transform
 
 HEIGHT_BAND = 0.01  # m
 FAR = 1e6  # m, beyond any leg
-AWAY = 5.0  # m, by which the request of a leg that hardly counts is out of the way of others
 
 
 @struct
@@ -82,30 +82,44 @@ class AbstractPelvis(Rule):
 def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
     """Mean of requested heights, m, weighted by the load of each leg; 0 if no leg counts."""
     mean = vec.safe_divide(vec.sum_last(sensed.load * requested), vec.sum_last(sensed.load))
-    return mean * greatest_count(sensed)
+    return mean * greatest_load(sensed)
 
 
-def greatest_count(sensed: Sensed) -> Float[Array, ""]:
-    """0..1, how far the leg counts that counts most."""
-    return HARD.maximum(sensed.counted, band=0.0)
+def greatest_load(sensed: Sensed) -> Float[Array, ""]:
+    """0..1, the load of the leg that has most."""
+    return HARD.maximum(sensed.load, band=0.0)
 
 
-def lifted_out(sensed: Sensed, heights: Array, most: Array | float = 1.0) -> Float[Array, " legs"]:
-    """Heights, m, so much higher that those of legs that count less than the `most` limit nothing.
-
-    Without `most`, a leg that does not count in full limits less, even if none counts more.
-    """
-    away = heights + AWAY * (most - sensed.counted)
-    return jnp.where(sensed.load > 0, away, FAR)
+def limits_of(sensed: Sensed, heights: Array, free: Array) -> Float[Array, " legs"]:
+    """Heights, m, as limits: the less load a leg has, the less is its limit below `free`, m."""
+    below = jnp.where(heights < free, free - heights, 0.0)
+    return jnp.where(sensed.load > 0, heights + (1.0 - sensed.load) * below, FAR)
 
 
 def lowest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
-    """The lowest of the heights of the legs that count most, m; `FAR` if none does."""
-    return gate.minimum(lifted_out(sensed, heights, greatest_count(sensed)), band=HEIGHT_BAND)
+    """The lowest of the heights of legs, m; 0 if none has any load.
+
+    It is the mean over all choices of some of the legs, each of which has its load as probability:
+    so a change of a load by x moves it by at most x times what that leg moves it at all.
+    """
+    heights = jnp.where(sensed.load > 0, heights, 0.0)
+    loads, each = vec.unstack(sensed.load), vec.unstack(heights)
+
+    def is_lower(leg: int, other: int) -> Array:
+        """1 if so, else 0; of two that are equal, the first is lower."""
+        if leg > other:
+            return 1.0 - is_lower(other, leg)
+        return gate.below(each[leg], each[other], band=HEIGHT_BAND)
+
+    shares = list(loads)
+    for leg, other in itertools.permutations(range(len(loads)), 2):
+        shares[leg] *= 1.0 - loads[other] * is_lower(other, leg)
+    share = vec.stack(*shares)
+    return vec.safe_divide(vec.sum_last(share * heights), vec.sum_last(share))
 
 
 def highest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
-    """The highest of the heights of the legs that count most, m; `-FAR` if none does."""
+    """The highest of the heights of legs, m, likewise."""
     return -lowest_of(gate, sensed, -heights)
 
 

@@ -17,7 +17,7 @@ from .base import (
     PelvisMoment,
     PelvisState,
     highest_of,
-    lifted_out,
+    limits_of,
     lowest_of,
     requested_heights,
     rise_to_length,
@@ -115,7 +115,7 @@ class CapsulePelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        requested = sensed.counted * requested_heights(sensed, target.pos)
+        requested = sensed.load * requested_heights(sensed, target.pos)
         lowest = gate.minimum(requested, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
@@ -167,9 +167,9 @@ class LegLengthPelvis(AbstractPelvis):
         highest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.max_length)
         found = sensed.foothold.found > 0
         zero = jnp.zeros_like(lowest[:1])
-        floors = jnp.where(found, lifted_out(sensed, -lowest), FAR)
+        floors = jnp.where(found, limits_of(sensed, -lowest, jnp.zeros_like(lowest)), FAR)
         floor = -gate.minimum(jnp.concatenate([floors, zero]), band=HEIGHT_BAND)
-        ceilings = jnp.where(found, lifted_out(sensed, highest), FAR)
+        ceilings = jnp.where(found, limits_of(sensed, highest, floor), FAR)
         ceilings = jnp.concatenate([ceilings, floor[None]])
         goal = jnp.where(self.enabled, gate.minimum(ceilings, band=HEIGHT_BAND), 0.0)
 

@@ -4,24 +4,24 @@ import dataclasses
 from abc import abstractmethod
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import HARD
 from jaxik.maths.parameter_tree import Leaf, half_life, length, ratio, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import counted
 from jaxik.world.skeleton import Transform, mean_position
 
 from .base import (
+    FAR,
     HEIGHT_BAND,
     AbstractPelvis,
     PelvisMoment,
     PelvisState,
-    greatest_count,
+    greatest_load,
     highest_of,
-    lifted_out,
+    limits_of,
     lowest_of,
     mean_height,
     rise_to_length,
@@ -104,7 +104,7 @@ class SupportPelvis(AbstractFollowingPelvis):
         lowest = lowest_of(gate, sensed, requested)
         support = vec.safe_divide(vec.sum_last(weight * requested), total)
         height = smoothing.lerp(support, lowest, self.lowest_share)
-        height = smoothing.lerp(resting, height, counted(total))
+        height = smoothing.lerp(resting, height, smoothing.clip_to_one(total))
         return Goal(height, jnp.zeros_like(resting))
 
 
@@ -152,24 +152,26 @@ class ReachPelvis(AbstractFollowingPelvis):
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
-        count, mean = greatest_count(sensed), mean_height(sensed, requested)
-        highest = count * highest_of(gate, sensed, requested)
+        load, mean = greatest_load(sensed), mean_height(sensed, requested)
+        highest = load * highest_of(gate, sensed, requested)
         wanted = smoothing.lerp(mean, highest, self.highest_share)
         longest = self.extension * (sensed.thigh + sensed.shin)
         forward_ws, hip_ws = sensed.slope.forward_ws, _tilted_hips(now)
 
-        def heights(hip_ws: Array, ankle_ws: Array) -> Array:
-            return lifted_out(sensed, rise_to_length(sensed, hip_ws, ankle_ws, longest))
-
         def limiting_ahead(hip_ws: Array, ankle_ws: Array) -> Array:
             """How far ahead of its hip the foot is whose leg limits the height, m."""
-            limits = jax.nn.softmax(-heights(hip_ws, ankle_ws) / self.softness)
-            reach = limits * vec.dot(ankle_ws - hip_ws, forward_ws)
-            return count * vec.sum_last(reach)
+            heights = rise_to_length(sensed, hip_ws, ankle_ws, longest)
+            top = HARD.maximum(jnp.where(sensed.present, heights, -FAR), band=0.0)
+            _, shares = self._lowest(limits_of(sensed, heights, top), sensed.load)
+            reach = shares * vec.dot(ankle_ws - hip_ws, forward_ws)
+            return load * vec.safe_divide(vec.sum_last(reach), vec.sum_last(shares))
 
         def reachable_height(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
-            limits = jnp.concatenate([heights(hip_ws, ankle_ws), wanted[None]])
-            return -self.softness * jax.nn.logsumexp(-limits / self.softness)
+            heights = rise_to_length(sensed, hip_ws, ankle_ws, longest)
+            limits = vec.stack(*vec.unstack(limits_of(sensed, heights, wanted)), wanted)
+            weights = vec.stack(*vec.unstack(sensed.load), jnp.ones_like(wanted))
+            lowest, shares = self._lowest(limits, weights)
+            return lowest - self.softness * jnp.log(vec.sum_last(shares))
 
         animated_ws = sensed.unscaled_ankle_ws
         ahead = limiting_ahead(hip_ws, target.pos) - limiting_ahead(sensed.hip_ws, animated_ws)
@@ -177,6 +179,11 @@ class ReachPelvis(AbstractFollowingPelvis):
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
         animated = reachable_height(sensed.hip_ws, animated_ws, jnp.zeros_like(wanted))
         return Goal(reachable_height(shifted_ws, target.pos, wanted) - animated, ahead)
+
+    def _lowest(self, limits: Array, weights: Array) -> tuple[Array, Array]:
+        """The lowest of limits, m, and how far each of them, of these weights, is the lowest."""
+        lowest = HARD.minimum(limits, band=0.0)
+        return lowest, weights * jnp.exp((lowest - limits) / self.softness)
 
 
 def _tilted_hips(now: PelvisMoment) -> Float[Array, "legs 3"]:

@@ -3,8 +3,9 @@
 Everything is in world space unless it says _ms. The other systems share what they share.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,8 +148,10 @@ def lean(
 ) -> tuple[float, list[Motion], Array, Array]:
     """Slide weight, smoothed slope (2), body rotation (4) and smoothed normal (3)."""
     right = cross(forward, up)
-    weights = [foot.grounded * foot.weight for foot in feet]
-    normal = up if sum(weights) == 0.0 else weights @ np.array([foot.hit.normal for foot in feet])
+    stands, weights = (
+        np.array([getattr(x, name) for x in feet]) for name in ("grounded", "weight")
+    )
+    normal = standing_normal(stands, weights, np.array([foot.hit.normal for foot in feet]), up)
     goals = [math.atan2(-float(normal @ axis), float(normal @ up)) for axis in (forward, right)]
 
     if state is None:
@@ -302,10 +305,33 @@ def lock(
     return after, of_ankle(offset, turn), rot
 
 
-def lowest_of(gaps: Sequence[float], weights: Sequence[float]) -> float:
-    """The lowest of heights, m, of which one with a partial weight is partly the highest; or 0."""
-    top = max(gaps, default=0.0)
-    return min((top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True)), default=0.0)
+def standing_normal(stands: Array, weights: Array, normals: Array, up: Array) -> Array:
+    """Mean normal of the ground under standing feet, the nearer to up the less weight they have."""
+    loads = stands * weights
+    if loads.sum() == 0.0:
+        return up
+    mean = loads @ normals / loads.sum()
+    return up + min(loads.sum() / stands.max(), 1.0) * (mean - up)
+
+
+def over_choices(
+    pick: Callable[[list[float]], float], heights: Sequence[float], loads: Sequence[float]
+) -> float:
+    """The mean of what is picked of some heights, m, each of them there with its load; or 0."""
+    mean = some = 0.0
+    for there in itertools.product((False, True), repeat=len(heights)):
+        if any(there):
+            chances = (x if is_there else 1.0 - x for x, is_there in zip(loads, there, strict=True))
+            chance = math.prod(chances)
+            mean += chance * pick(list(itertools.compress(heights, there)))
+            some += chance
+    return mean / some if some else 0.0
+
+
+def lowest_of(gaps: Sequence[float], weights: Sequence[float], loads: Sequence[float]) -> float:
+    """The lowest of heights, m, of which one with a partial weight is partly the highest."""
+    top = over_choices(max, gaps, loads)
+    return min(top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True))
 
 
 def follow_by_gain(
@@ -332,16 +358,15 @@ def pelvis_height(
     parameters: Parameters, feet: list[Foot], targets: list[Array], up: Array, before: float | None
 ) -> float:
     """Smoothed height of the body above its animated position, m along up or the normal."""
-    gaps, weights = [], []
-    for foot, target in zip(feet, targets, strict=True):
-        if foot.weight > 0.0:
-            gaps.append(float(up @ (target - foot.pos_ws("ankle"))))
-            weights.append(foot.grounded * foot.weight)
-    low = lowest_of(gaps, weights)
+    pairs = zip(feet, targets, strict=True)
+    gaps = [float(up @ (target - foot.pos_ws("ankle"))) for foot, target in pairs]
+    loads = [foot.weight for foot in feet]
+    weights = [foot.grounded * foot.weight for foot in feet]
+    low = lowest_of(gaps, weights, loads)
     if parameters["pelvis.wait_to_rise"]:
-        low = min(low, max(0.0, min(gaps, default=0.0)))
+        low = min(low, max(0.0, over_choices(min, gaps, loads)))
     low = max([low, *unfolded_heights(parameters, low, feet, targets, up)])
-    contact = max(weights, default=0.0)
+    contact = max(weights)
     resting = before if before and parameters["pelvis.wait_to_rise"] else 0.0
     return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt, resting)
 

@@ -1,5 +1,6 @@
 """The lean of the trunk: forward uphill, backward downhill, over a pelvis that tilts less."""
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -8,13 +9,14 @@ import numpy as np
 from reference import maths
 from reference.characters import Parameters, forward, named
 from reference.maths import Array, cross, lerp
+from reference.stages import ground
 
 DEFAULTS = (
     named("lean", uphill_rate=-0.65, downhill_rate=-0.25, side_rate=0.0, head_share=0.5)
     | named("lean", forward_rate_slide=0.0, side_rate_slide=0.0)
     | named("lean", pelvis_rate=-0.25, pelvis_side_rate=0.0, spacing=0.3, half_life=0.2)
 )
-COUNTS = 0.1  # weight of all legs together from which their slope is taken in full
+LITTLE = 0.1  # of a foot's ground, from which its slope is taken in full
 
 
 @dataclass
@@ -31,12 +33,13 @@ def lean(
     root_rot: Array,
     points: Array,
     normals: Array,
-    weights: Array,
+    stands: Array,
     slide: float,
     dt: float,
     state: State | None,
     up: Array = maths.Y,
-    legs: Array | None = None,
+    found: Array | float = 1.0,
+    weights: Array | None = None,
 ) -> tuple[State, Array, Array, Array]:
     """Memory after a frame, and the rotations of trunk, head and pelvis, world axes.
 
@@ -47,25 +50,27 @@ def lean(
         root_rot: rotation of the character (4).
         points: of the ground under each foot (legs, 3), m.
         normals: of the ground under each foot (legs, 3).
-        weights: how much each foot stands (legs).
+        stands: how much each foot stands (legs).
         slide: how much the character slides, 0..1.
         dt: s since the frame before.
         state: memory after the frame before.
         up: unit.
-        legs: how much each foot counts for the slope between the feet; None is 1.
+        found: whether there is ground under each foot (legs).
+        weights: of the legs; None is 1.
     """
     ahead_ws = forward(root_rot, up)
     right_ws = cross(ahead_ws, up)
-    normal = weights @ normals if weights.any() else up
-    legs = np.ones(len(points)) if legs is None else legs
+    weights = np.ones(len(points)) if weights is None else weights
+    normal = ground.standing_normal(stands, weights, normals, up)
     ahead, aside = (
         between_feet(
             parameters["lean.spacing"],
             points @ along_ws,
             points @ up,
-            min(weights.sum() / COUNTS, 1.0)
+            min(stands.sum() / LITTLE, 1.0)
             * math.atan2(-float(normal @ along_ws), float(normal @ up)),
-            legs,
+            found * weights,
+            weights,
         )
         for along_ws in (ahead_ws, right_ws)
     )
@@ -86,18 +91,25 @@ def lean(
 
 
 def between_feet(
-    spacing: float, places: Array, heights: Array, under_soles: float, legs: Array
+    spacing: float,
+    places: Array,
+    heights: Array,
+    under_soles: float,
+    legs: Array,
+    weights: Array,
 ) -> float:
     """Slope, rad, of the line through the feet that is pulled to the slope under their soles.
 
     It is the ridge regression of heights by places with a prior `spacing / 2`, found here as
-    weighted least squares with one more row, that pulls to the tangent under the soles.
+    weighted least squares with one more row, that pulls to the tangent under the soles. With
+    partial weights the line counts as much as pairs of legs do.
     """
     if legs.sum() == 0.0:
         return under_soles
     shares = legs / legs.sum()
     places, heights = places - shares @ places, heights - shares @ heights
-    counted = np.sqrt(min(legs.sum() / COUNTS, 1.0) * shares)
+    pairs = sum(a * b for a, b in itertools.combinations(weights, 2))
+    counted = np.sqrt(min(pairs, 1.0) * shares)
     rows = np.append(counted * places, spacing / 2)
     goals = np.append(counted * heights, spacing / 2 * math.tan(under_soles))
     (tangent,), *_ = np.linalg.lstsq(rows[:, None], goals, rcond=None)

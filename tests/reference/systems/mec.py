@@ -8,7 +8,7 @@ import numpy as np
 
 from reference import characters, maths
 from reference.characters import Frame, Ground, Leg, Parameters, Rig, named
-from reference.maths import Array, across, cross, from_axis_angle, multiply, rotate, unit
+from reference.maths import Array, across, cross, from_axis_angle, lerp, multiply, rotate, unit
 from reference.stages import ground, limb
 from reference.stages.ground import Standing
 from reference.terrain import ALL_LAYERS, Hit
@@ -268,16 +268,19 @@ def pelvis_height(
     state: State | None,
 ) -> float:
     """Height of the body above its animated position, m, at which every leg is long enough."""
-    goal, lows, highs = 0.0, [], []
+    goal, lows, highs, loads = 0.0, [], [], []
     for foot, target in zip(feet, targets, strict=True):
-        if foot.found and foot.weight > 0.0:
+        if foot.found:
+            loads.append(foot.weight)
             gap = target - foot.pos_ws("hip")
             along = float(gap @ up)
             across_squared = float(gap @ gap) - along**2
             for ends, name in ((lows, "pelvis.min_length"), (highs, "pelvis.max_length")):
                 ends.append(along + math.sqrt(max(foot[name] ** 2 - across_squared, 0.0)))
     if lows and parameters["pelvis.enabled"]:
-        goal = min(max(0.0, *lows), *highs)
+        goal = max(0.0, *(load * low for load, low in zip(loads, lows, strict=True)))
+        sunk = [lerp(goal, high, load) for load, high in zip(loads, highs, strict=True)]
+        goal = min(goal, *sunk)
     if state is None or not parameters["pelvis.damp"]:
         return goal
     dt = feet[0].frame.dt

@@ -142,12 +142,11 @@ def pelvis_height(
     parameters: Parameters, feet: list[Foot], up: Array, state: State | None
 ) -> float:
     """Height of the body above its animated position along up, m."""
-    taking_part = [foot for foot in feet if foot.weight > 0.0]
-    gaps = [float(up @ (foot.target_ws - foot.ankle_ws)) for foot in taking_part]
-    weights = [foot.weight if foot.hit.found else 0.0 for foot in taking_part]
-    contact = max(weights, default=0.0) if parameters["pelvis.enabled"] else 0.0
+    gaps = [float(up @ (foot.target_ws - foot.ankle_ws)) for foot in feet]
+    weights = [foot.weight if foot.hit.found else 0.0 for foot in feet]
+    contact = max(weights) if parameters["pelvis.enabled"] else 0.0
     before = state.pelvis_height if state else None
-    low = ground.lowest_of(gaps, weights)
+    low = ground.lowest_of(gaps, weights, [foot.weight for foot in feet])
     return ground.follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)
 
 

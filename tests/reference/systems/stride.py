@@ -179,14 +179,14 @@ def lean(
     parameters: Parameters, up: Array, feet: list[Foot], state: State | None, frame: Frame
 ) -> tuple[spine.State, Array]:
     """Memory of the lean after this frame, and the tilt of the pelvis, world axes."""
-    legs = np.array([foot.weight * foot.hit.found for foot in feet])
-    standing = legs * [foot.contact for foot in feet]
+    weights, found = np.array([(foot.weight, foot.hit.found) for foot in feet]).T
+    standing = found * [foot.contact for foot in feet]
     root = frame.world_from_model
     points = np.array([foot.hit.point - root.pos for foot in feet])
     normals = np.array([foot.hit.normal for foot in feet])
     before = state.lean if state else None
     ground_under = (root.rot, points, normals, standing, frame.slide)
-    after, _, _, tilt = spine.lean(parameters, *ground_under, frame.dt, before, up, legs)
+    after, _, _, tilt = spine.lean(parameters, *ground_under, frame.dt, before, up, found, weights)
     return after, tilt
 
 
@@ -202,9 +202,9 @@ def support_goal(
     if sum(weights) == 0.0:
         return resting
     support = float(np.average(requested, weights=weights))
-    lowest = min(gap for gap, w in zip(requested, leg_weights, strict=True) if w > 0.0)
+    lowest = ground.over_choices(min, requested, leg_weights)
     goal = support + parameters["pelvis.lowest_share"] * (lowest - support)
-    return lerp(resting, goal, min(sum(weights) / spine.COUNTS, 1.0))
+    return lerp(resting, goal, min(sum(weights), 1.0))
 
 
 def reach_goal(
@@ -220,38 +220,42 @@ def reach_goal(
 
     Also how far ahead of the animation the body goes, towards the foot that limits it.
     """
-    rows = [row for row in zip(feet, targets, requested, hips, strict=True) if row[0].weight > 0.0]
-    if not rows:
+    loads = np.array([foot.weight for foot in feet])
+    if not loads.any():
         return 0.0, 0.0
-    gaps = [gap for _, _, gap, _ in rows]
-    mean = float(np.average(gaps, weights=[foot.weight for foot, *_ in rows]))
-    wanted = lerp(mean, max(gaps), parameters["pelvis.highest_share"])
+    mean = float(np.average(requested, weights=loads))
+    highest = ground.over_choices(max, requested, list(loads))
+    wanted = float(loads.max()) * lerp(mean, highest, parameters["pelvis.highest_share"])
     softness = parameters["pelvis.softness"]
-    longest = [parameters["pelvis.extension"] * foot.length for foot, *_ in rows]
-    animated = [foot.pos_ws("ankle") - foot.pos_ws("hip") for foot, *_ in rows]
-    moved = [target - hip for _, target, _, hip in rows]
+    longest = [parameters["pelvis.extension"] * foot.length for foot in feet]
+    animated = [foot.pos_ws("ankle") - foot.pos_ws("hip") for foot in feet]
+    moved = [target - hip for target, hip in zip(targets, hips, strict=True)]
 
-    def highest_hips(to_feet: list[Array]) -> list[float]:
+    def highest_hips(to_feet: list[Array]) -> Array:
         """How far each hip may rise, m, until its leg is as long as it may be."""
-        return [
+        rises = (
             float(way @ up)
             + math.sqrt(max(0.0, limit**2 - float(maths.across(way, up) @ maths.across(way, up))))
             for way, limit in zip(to_feet, longest, strict=True)
-        ]
+        )
+        return np.array(list(rises))
+
+    def eased(heights: Array, free: float) -> Array:
+        """Limits, m, of which legs of little weight are no further below `free` than that."""
+        return heights + (1.0 - loads) * np.maximum(free - heights, 0.0)
 
     def limiting_ahead(to_feet: list[Array]) -> float:
         """How far ahead of its hip the foot is that limits the height, blended softly, m."""
-        heights = np.array(highest_hips(to_feet))
-        shares = np.exp((heights.min() - heights) / softness)
-        return float(shares @ np.array(to_feet) @ forward / shares.sum())
+        heights = highest_hips(to_feet)
+        heights = eased(heights, heights.max())
+        shares = loads * np.exp((heights.min() - heights) / softness)
+        return float(loads.max() * (shares @ np.array(to_feet) @ forward) / shares.sum())
+
+    def reachable(heights: Array, free: float) -> float:
+        """A smooth lower bound of the height wanted and what the legs reach, m."""
+        parts = loads @ np.exp((free - eased(heights, free)) / softness)
+        return free - softness * math.log(1.0 + parts)
 
     ahead = parameters["pelvis.shift"] * (limiting_ahead(moved) - limiting_ahead(animated))
     shifted = highest_hips([way - ahead * forward for way in moved])
-    height = soft_minimum([wanted, *shifted], softness)
-    return height - soft_minimum([0.0, *highest_hips(animated)], softness), ahead
-
-
-def soft_minimum(values: list[float], softness: float) -> float:
-    """A smooth lower bound of the values, m."""
-    lowest = min(values)
-    return lowest - softness * math.log(sum(math.exp((lowest - x) / softness) for x in values))
+    return reachable(shifted, wanted) - reachable(highest_hips(animated), 0.0), ahead

@@ -42,8 +42,7 @@ def step(
 
     hip_goal = 0.0
     if parameters["pelvis.enabled"]:
-        taking_part = [x for x, leg in zip(offsets, legs, strict=True) if leg.weight > 0.0]
-        hip_goal = min([0.0, *taking_part])
+        hip_goal = min(0.0, *(leg.weight * x for x, leg in zip(offsets, legs, strict=True)))
     goals = [offset - hip_goal for offset in offsets]
     state = advance(parameters, state, idle, hip_goal, goals, legs)
 
