@@ -101,7 +101,7 @@ class Original(NamedTuple):
 LIMITS = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope", "probe.step_fade")
 SUPPORT = ("probe.min_support", "probe.support_radius")
 ROOT = ("root.ray_", "root.layers", "root.half_life", "root.max_")
-SPEED_OF_ROOT = ("root.max_speed", "root.max_step")
+SMOOTH_ROOT = ("root.max_speed", "root.max_step", "root.max_gap")
 
 
 def _is_on(ik: jaxik.FootIK, name: str) -> bool:
@@ -119,7 +119,7 @@ def _off(ik: jaxik.FootIK) -> tuple[str, ...]:
     names += () if options.get("foot.bend_toes") else ("foot.toe_length", "foot.max_toe_")
     if not _is_on(ik, "root.enabled"):
         return names + ROOT
-    return names + (() if _is_on(ik, "root.half_life") else SPEED_OF_ROOT)
+    return names + (() if _is_on(ik, "root.half_life") else SMOOTH_ROOT)
 
 
 def _off_in_ozz(ik: jaxik.FootIK) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Stage 2: the height of the whole character."""
 
+import dataclasses
 from abc import abstractmethod
 from math import inf
 from typing import ClassVar
@@ -9,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import parameter_tree, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life, speed, switch, threshold
+from jaxik.maths.parameter_tree import Leaf, Rule, constant, half_life, speed, switch, threshold
 from jaxik.maths.struct import place, struct
-from jaxik.world.frame import rise_of
+from jaxik.world.frame import heading, rise_of
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, cast
 
@@ -95,6 +96,9 @@ class GroundRoot(AbstractRoot):
     game has it; ahead, that which is nearer to the ground here. With a half-life of 0, as in ozz,
     the highest counts.
 
+    It stands on what carries its width: over a gap narrower than `max_gap` on the lower of both
+    sides, except with a half-life of 0.
+
     Without ground, in the air, or with `enabled` off, the character stays as far from where the
     game has it as it was.
     """
@@ -121,6 +125,8 @@ class GroundRoot(AbstractRoot):
         unit="m",
     )
 
+    max_gap: Leaf = constant(0.15, "Width of the widest gap that it crosses.", unit="m")
+
     def init(self, rig: Rig) -> RootState:
         zero = jnp.zeros((), rig.side.dtype)
         return RootState(zero, zero, zero)
@@ -135,8 +141,12 @@ class GroundRoot(AbstractRoot):
         lower = jnp.where(self.max_step < self.ray_up, self.max_step, self.ray_up)
         starts = jnp.stack([self.ray_up, lower])[:, None]
         points = jnp.stack([origin, origin + travel])
-        reaches = starts + self.ray_down + jnp.zeros(2, origin.dtype)
-        hits = cast(inputs.terrain.body, points + vec.scale(up, starts), reaches, self.layers)
+        away = jnp.where(self.half_life > 0, self.max_gap, 0.0)
+        forward_ws, right_ws = heading(frame.world_from_model, up)
+        side = vec.scale(forward_ws + right_ws, away)  # for gaps along its way and across
+        points += vec.scale(up, starts) + jnp.stack([0.0 * side, side, -side])[:, None, None]
+        reaches = starts + self.ray_down + jnp.zeros_like(points[..., 0])
+        hits = _over_gaps(cast(inputs.terrain.body, points, reaches, self.layers), up)
         ahead = jax.tree.map(lambda leaf: leaf[:, 1], hits)
 
         def below(ray: int) -> RootGround:
@@ -200,3 +210,13 @@ class GroundRoot(AbstractRoot):
         velocity = gate.choose(sensed.found, velocity, jnp.zeros_like(velocity))
         offset = height - sensed.origin
         return RootState(height, velocity, offset), offset
+
+
+def _over_gaps(hits: Hit, up: Array) -> Hit:
+    """Hits below a place, the first, and beside it: that place as high as the lower side."""
+    here, left, right = (jax.tree.map(lambda leaf: leaf[i], hits) for i in range(3))  # noqa: B023
+    sides = left.found * right.found
+    height, *others = vec.dot(hits.point, up)
+    lower = jnp.where(others[0] < others[1], *others)
+    depth = jnp.where(lower > height, sides * (lower - height), 0.0)
+    return dataclasses.replace(here, point=here.point + vec.scale(up, depth))

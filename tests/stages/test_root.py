@@ -157,6 +157,17 @@ def test_nothing_lifts_a_character_that_goes_below_a_bench_or_a_roof(height):
     np.testing.assert_allclose(lifted, 0.0, atol=1e-6)
 
 
+def test_the_root_crosses_gaps_narrower_than_itself():
+    fields = [
+        terrain.heightfield(jnp.full((2, 2), level), (20.0, length), (-10.0, 0.0, start),
+                            interpolation="triangulated")
+        for level, start, length in ((-0.3, -39.0, 80.0), (0.0, -39.0, 40.0), (0.0, 1.14, 40.0))
+    ]  # fmt: skip
+    ground = terrain.combine(*fields)
+    np.testing.assert_allclose(heights(ground, glide(), GroundRoot()), 0.0, atol=1e-6)
+    assert heights(ground, glide(), GroundRoot(max_gap=0.1)).min() < -0.01
+
+
 def test_the_root_moves_no_faster_than_its_limit():
     lifted = heights(step(-2.0), glide(), GroundRoot(max_speed=1.0))
     speed = np.abs(np.diff(lifted)) * HZ

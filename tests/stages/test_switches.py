@@ -181,6 +181,7 @@ LARGEST = [pytest.param(name, marks=pytest.mark.slow) for name in LARGE]
 # In `test_own_rules`, `test_limits`, `test_foot_placement` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
 IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
+IN_OWN_TESTS += ("root.max_gap",)
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from reference.terrain import ALL_LAYERS, Hit
 
 DEFAULTS = (
     named("root", enabled=True, ray_up=10.0, ray_down=math.inf, layers=ALL_LAYERS)
-    | named("root", half_life=0.2, max_speed=4.0, max_step=0.4)
+    | named("root", half_life=0.2, max_speed=4.0, max_step=0.4, max_gap=0.15)
     | named("probe", ray_up=0.5, ray_down=math.inf)
     | named("target", foot_height=0.12, max_slope=1.5)
     | named("pelvis", enabled=True, limit=math.inf, on_gain=1.0, off_gain=1.0, tick_hz=30.0)
@@ -101,9 +101,22 @@ def place_root(parameters: Parameters, terrain: Ground, frame: Frame, before: Ro
     travel = across(frame.travel_ws, up) * lag
     ray_up = parameters["root.ray_up"]
     reach, mask = ray_up + parameters["root.ray_down"], int(parameters["root.layers"])
-    here, there = (
-        terrain.cast(point + up * ray_up, reach, mask) for point in (origin, origin + travel)
+    ahead = characters.forward(frame.world_from_model.rot, up)
+    side = (ahead + maths.cross(ahead, up)) * (
+        parameters["root.max_gap"] if half_life > 0.0 else 0.0
     )
+
+    def below_body(point: Array) -> Hit:
+        """What carries the character there: over a narrow gap its lower side."""
+        hit, *sides = (
+            terrain.cast(point + away + up * ray_up, reach, mask) for away in (0.0, side, -side)
+        )
+        if hit.found and all(x.found for x in sides):
+            depth = min(float(up @ x.point) for x in sides) - float(up @ hit.point)
+            hit = hit._replace(point=hit.point + up * max(depth, 0.0))
+        return hit
+
+    here, there = map(below_body, (origin, origin + travel))
     if not (parameters["root.enabled"] and here.found and frame.grounded > 0.5):
         lift = before.lift if before else 0.0
         return Root(float(up @ origin) + lift, 0.0, lift)
