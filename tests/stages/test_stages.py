@@ -162,7 +162,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         LANDS("probe.max_step_up", (0.12, 0.18), "+ target height", STAIRS_UP, CLIMBS),
         LANDS("probe.max_step_down", (0.12, 0.18), "- target height", STAIRS_DOWN, CLIMBS),
         LANDS("probe.step_fade", (0.1, 0.2), "+ target height", STAIRS_UP, CLIMBS | LOW_STEPS),
-        LANDS("probe.max_slope", (0.3, 0.36), "- target height", tilted((0.4, 0, 0))),
+        LIFTS("probe.max_slope", (0.33, 0.37), "+ target height", tilted((0.4, 0, 0))),
         LIFTS("probe.held_lift", (0.3, 0.6), "- target height", STEP_DOWN),
         LANDS("probe.toe_clearance", (0.02, 0.04), "+ target height", STEP_UP),
         LANDS("probe.lift_per_rise", (0.3, 0.5), "+ target height", STEP_UP),

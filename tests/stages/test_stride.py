@@ -213,6 +213,24 @@ def test_a_plane_supports_the_whole_sole_and_moves_no_foot(slope):
     assert_close([slide, support], [0.0 * slide, 1.0 + 0.0 * slide], 1e-9)
 
 
+def test_the_slope_under_a_ball_goes_no_further_than_the_ground_under_the_ankle():
+    """On a root of 7 cm, whose flanks are of 54 degrees."""
+    profile = np.array(
+        [[-3.0, 0.0], [-0.08, 0.0], [-0.03, 0.07], [0.03, 0.07], [0.08, 0.0], [3.0, 0.0]]
+    )
+    sides = [
+        quad((-2.0, low, near), (-2.0, high, far), (2.0, high, far), (2.0, low, near))
+        for (near, low), (far, high) in zip(profile[:-1], profile[1:], strict=True)
+    ]
+    ground = PlainTerrain(maths.Y, triangles=np.array(sum([*sides, sides[-1]], [])))
+    frames = standing()
+    slide, _, height = slides(ground, frames)
+    ankle = (frames.world_from_model.pos[:, None] + frames.pose.ankle.pos)[:, 0, 2] + slide
+    assert np.abs(height - np.interp(ankle, *profile.T)).max() < 0.075
+    settled = np.abs(np.diff(slide)) < 1e-6
+    assert np.abs(np.diff(height))[settled].max() < 0.01, "over 0.5 mm"
+
+
 def test_toes_may_hang_over_an_edge():
     slide, support, height = slides(DROP_AHEAD)
     on_top = (PLACES < 0) & (height > -0.1)

@@ -19,7 +19,7 @@ from jaxik.world.terrain import Hit
 
 from . import foresight
 from .base import make_rays, no_hit
-from .limits import least_rise
+from .limits import climb, least_rise
 from .support import AbstractSupportedProbe
 from .swing import FAR, Level, s_curve
 
@@ -40,7 +40,8 @@ class StrideProbe(AbstractSupportedProbe):
 
     Only a step is curved in this way. The slope that both footholds and the line between them share
     is followed as the foot goes. The ground is sensed below the ball of the foot and continued to
-    below the ankle along the plane of the hits, so that on a slope the whole sole is on the ground.
+    below the ankle along the plane of the hits, as far as the ground there goes as well, so that on
+    a slope the whole sole is on the ground.
     Feet keep the slope of the ground in their swing, so that they neither leave nor meet it level.
 
     The animation may provide the footholds (`Frame.stride`). If not, or with `use_strides` off,
@@ -168,7 +169,12 @@ class StrideProbe(AbstractSupportedProbe):
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
         if stride.aside_ws is not None:
             path_ws += vec.scale(stride.aside_ws, 4.0 * fractions * (1.0 - fractions))
-        path = self.ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
+        ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
+        arm = vec.reject(ankle - ball, level.up_ws)
+        heels_ws = path_ws[jnp.array([0, -1])] + arm
+        hits = self.ground_at(inputs, level, jnp.concatenate([path_ws, heels_ws]))
+        # (points legs), as `path_ws`, and (ends legs), below the ankle at both footholds.
+        path, heels = (jax.tree.map(lambda x: x[at], hits) for at in (np.s_[:-2], np.s_[-2:]))  # noqa: B023
         if self.check_support:
             ends = self.ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
             path = jax.tree.map(lambda x, y: jnp.concatenate([y[:1], x[1:-1], y[1:]]), path, ends)
@@ -189,7 +195,6 @@ class StrideProbe(AbstractSupportedProbe):
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
         trust *= 1.0 - smoothstep(_least_step(evened, path.found, self.excess) / self.step_fade)
 
-        ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
         covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
         height = low + trust * (slope * clip_to_one(covered) + step * fraction)
         normal += vec.scale(next_.normal - normal, trust * fraction)
@@ -204,7 +209,15 @@ class StrideProbe(AbstractSupportedProbe):
         step = jnp.where(step > stair, stair, jnp.where(step < -stair, -stair, step))
         swing = self.swing(inputs, stride, step, over, trust, below)
         height += self.clearance_over_edges(inputs, stride, swing, foot_height, edge)
-        height += self.climb(normal, ankle - ball, level.up_ws)
+        share = trust * fraction
+        parts = jnp.stack([1.0 - share, share]) * heels.found
+        heel_rises = level.height(heels.point) - jnp.stack([low, high])
+        heel_rise = vec.safe_divide(jnp.sum(parts * heel_rises, 0), jnp.sum(parts, 0))
+        # The ground under the ball may be a small piece; the heel stands on what is below it.
+        plane_rise = self.climb(normal, arm, level.up_ws)
+        rise = lerp(plane_rise, least_rise(plane_rise, heel_rise), jnp.sum(parts, 0))
+        height += rise
+        normal = _tilted(normal, arm, rise, level.up_ws)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
         platform = last.platform
@@ -260,6 +273,13 @@ class StrideProbe(AbstractSupportedProbe):
         """How much higher and lower than a step the ground may be there, m: as stairs go."""
         away = vec.length(level.project(points_ws) - level.origin_ws)
         return jnp.where(away > self.max_step_up, STAIRS * (away - self.max_step_up), 0.0)
+
+
+def _tilted(normal: Array, way: Array, rise: Array, up_ws: Array) -> Float[Array, "legs 3"]:
+    """The normal of ground turned across a level way, m, so that it rises by so much on it, m."""
+    steeper = vec.safe_divide(rise - climb(normal, way, up_ws), vec.dot(way, way))
+    facing = vec.dot(normal, up_ws)[..., None]
+    return vec.normalize(normal - facing * vec.scale(way, steeper), up_ws)
 
 
 def _least_step(

@@ -74,11 +74,23 @@ class UnderBall:
     found: float
     height: float = 0.0
     normal: Array = field(default_factory=lambda: np.zeros(3))
+    heel_rise: float = 0.0
+    heel_found: float = 0.0
     step: float = 0.0
     over: float = 0.0
     edge: float = 0.0
     sure: float = 0.0
     platform: int = -1
+
+    def under_ankle(self, leg: Leg) -> tuple[float, Array]:
+        """Height of the ground below the ankle, m, and the normal from there to the ball."""
+        arm = across(leg.pos_ws("ankle") - leg.pos_ws("toe"), leg.up)
+        plane = climb(leg, self.normal, arm)
+        rise = lerp(plane, shared_rise(plane, self.heel_rise), self.heel_found)
+        facing, squared = float(self.normal @ leg.up), float(arm @ arm)
+        missing = rise + float(arm @ self.normal) / facing
+        steeper = missing / squared if squared > 0.0 else 0.0
+        return self.height + rise, unit(self.normal - facing * steeper * arm, leg.up)
 
 
 def height(leg: Leg, point: Array) -> float:
@@ -244,7 +256,18 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
     normal = unit(last.normal + risen * (next_normal - last.normal), leg.up)
     platform = following.platform if sure * risen > 0.5 else last.platform
     step = clip(step, stair, -stair)
-    return UnderBall(stride, found, ground, normal, step, over, edge, sure * arrives, platform)
+    heel_rise, heel_found = 0.0, 0.0
+    arm = leg.pos_ws("ankle") - leg.pos_ws("toe")
+    share = sure * arrives * risen
+    for start, at, part in ((stride.last, low, 1.0 - share), (stride.next, high, share)):
+        heel = look(leg, level(leg, start + arm))
+        if heel.found:
+            heel_rise += part * (height(leg, heel.point) - at)
+            heel_found += part
+    if heel_found > 0.0:
+        heel_rise /= heel_found
+    under = ground, normal, heel_rise, heel_found
+    return UnderBall(stride, found, *under, step, over, edge, sure * arrives, platform)
 
 
 def highest(leg: Leg, heights: Sequence[float]) -> float:
@@ -278,10 +301,6 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
         return Hit(False, here, leg.up), stride
     lift, pitch = beyond_animation(leg, ball, below)
 
-    def beside_ball(point: Array) -> float:
-        """Height of the ground under a point of the foot, on the plane under its ball, m."""
-        return ball.height + climb(leg, ball.normal, point - ball_ws)
-
     def lift_over_edges() -> float:
         """How far the ground must be raised for the animated sole to clear what is on its path."""
         axes = leg.world_from_foot
@@ -298,9 +317,10 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
             lowest = min(lowest, clearance + lift + float((moved - point) @ leg.up))
         return 0.5 * (arc - lowest + math.hypot(arc - lowest, GIVES_WAY * arc))
 
-    point = here + leg.up * (beside_ball(ankle) + lift_over_edges())
+    ground, under = ball.under_ankle(leg)
+    point = here + leg.up * (ground + lift_over_edges())
     stride = replace(stride, lift=lift * ball.found, pitch=pitch * ball.found)
-    normal = unit(leg.up + ball.found * (ball.normal - leg.up), leg.up)
+    normal = unit(leg.up + ball.found * (under - leg.up), leg.up)
     return Hit(ball.found, point, normal, ball.platform), stride
 
 
