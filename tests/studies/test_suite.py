@@ -203,7 +203,7 @@ def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
 @pytest.mark.parametrize(
     ("chosen", "names"),
     [
-        # Longer: swings that the end cuts off as they begin may pop on stairs.
+        # Longer: the bound of pops is that of the fastest whole swing, and few are whole in 1.5 s.
         (plan(*FEW)._replace(seconds=2.5), ["stride"]),
         pytest.param(suite.choose(), preset_names(), marks=pytest.mark.slow),
     ],
