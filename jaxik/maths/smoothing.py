@@ -102,6 +102,33 @@ def spring(before: Motion, goal: Array, half_life: Array, dt: Array) -> Motion:
     return _spring(before, goal, fraction_of_half_life(half_life, dt), dt)
 
 
+class Deviation(NamedTuple):
+    """A value that is to become 0, with its velocity and acceleration."""
+
+    value: Float[Array, "*b"]
+    velocity: Float[Array, "*b"]
+    """Per second."""
+    acceleration: Float[Array, "*b"]
+    """Per second squared."""
+
+
+def settle(before: Deviation, time: Array, dt: Array) -> Deviation:
+    """A deviation after `dt` s on its way of minimum jerk to rest at 0 in `time` s, above 0.
+
+    Called in each frame with the time that is left, it arrives smoothly wherever it was moved
+    meanwhile (Hoff and Arbib 1993); with the same time in each frame it never quite arrives.
+    """
+    x = clip_to_one(dt / time)
+    slope, curve = before.velocity * time, before.acceleration * time * time
+    third = -10.0 * before.value - 6.0 * slope - 1.5 * curve
+    fourth = 15.0 * before.value + 8.0 * slope + 1.5 * curve
+    fifth = -6.0 * before.value - 3.0 * slope - 0.5 * curve
+    value = before.value + x * (slope + x * (0.5 * curve + x * (third + x * (fourth + x * fifth))))
+    velocity = slope + x * (curve + x * (3.0 * third + x * (4.0 * fourth + x * 5.0 * fifth)))
+    acceleration = curve + x * (6.0 * third + x * (12.0 * fourth + x * 20.0 * fifth))
+    return Deviation(value, velocity / time, acceleration / (time * time))
+
+
 @vec.remat
 def follow(before: Motion, goal: Array, fraction: Array, dt: Array, use_spring: Array) -> Motion:
     """Exponential or, where `use_spring`, spring towards a goal, after `dt` s.

@@ -9,7 +9,16 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, angle, half_life, length, switch
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    angle,
+    constant,
+    half_life,
+    length,
+    option,
+    switch,
+)
 from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Contact, Foothold, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
@@ -17,6 +26,8 @@ from jaxik.world.skeleton import Rig
 from .inputs import Inputs, SensedMoment
 
 HEIGHT_BAND = 0.01  # m
+FOLLOWED = 0.01  # s, half-life with which a foothold's velocity follows its height
+SOONEST, LATEST = 0.12, 0.25  # s, in which a foot makes up for a jump of its foothold
 
 
 class AbstractTarget(Rule):
@@ -48,6 +59,20 @@ class TargetState:
     """m/s, over the ground; 0 unless it follows as a spring."""
     point_ws: Float[Array, "legs 3"] = place("point")
     """m, the foothold before smoothing."""
+    jumps: "Jumps | None" = None
+    """None unless jumps are absorbed."""
+
+
+@struct
+class Jumps:
+    """How the heights of footholds would go on, and what is left of their jumps."""
+
+    goal: Float[Array, " legs"] = place("leg height")
+    """m, the height in this frame, before smoothing."""
+    goal_velocity: Float[Array, " legs"]
+    """m/s, of that over the ground, without its jumps."""
+    left: smoothing.Deviation
+    """m, m/s and m/s² (legs)."""
 
 
 class SlopeTarget(AbstractTarget):
@@ -61,6 +86,10 @@ class SlopeTarget(AbstractTarget):
     then stays between two heights in model space. Without ground the foothold is that of the
     animation. A limb that bears nothing, such as a hand on a wall, has no animated lift: its sole
     lies on the ground where it stands, and where it does not it stays as animated.
+
+    With `absorb_jumps` on, a foothold whose height changes by more than `max_acceleration` allows
+    does not take its foot along: the foot goes on as it did and makes up for the difference with
+    minimum jerk, by the time it lands (inertialisation, Bollo 2018).
     """
 
     min_ankle_height: Leaf = length(-0.3, -1, 0.5, "Lowest height of the ankle in model space.")
@@ -86,6 +115,9 @@ class SlopeTarget(AbstractTarget):
     follow_slopes: Leaf = switch(
         False, "Whether footholds keep up with a slope on which they move, without delay."
     )
+    max_acceleration: Leaf = constant(
+        40.0, "Acceleration of a foothold's height from which its changes are jumps.", unit="m/s^2"
+    )
     max_penetration: Leaf = length(
         inf,
         0,
@@ -93,9 +125,16 @@ class SlopeTarget(AbstractTarget):
         "Depth to which a level sole may be in the ground while its foothold rises to it.",
     )
 
+    absorb_jumps: bool = option(
+        False, "Whether a foot goes on smoothly where its foothold jumps: a prediction changed."
+    )
+
     def init(self, rig: Rig) -> TargetState:
         zero = jnp.zeros_like(rig.side)
-        return TargetState(zero, zero, jnp.zeros((*zero.shape, 3), zero.dtype))
+        point = jnp.zeros((*zero.shape, 3), zero.dtype)
+        left = smoothing.Deviation(zero, zero, zero)
+        jumps = Jumps(zero, zero, left) if self.absorb_jumps else None
+        return TargetState(zero, zero, point, jumps)
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         hit, up_ws = ground.ankle, inputs.terrain.leg_up_ws
@@ -121,6 +160,10 @@ class SlopeTarget(AbstractTarget):
         swing_lift = now.sensed.ground.lift
         ground = vec.dot(foothold.point_ws, now.sensed.leg_up_ws)
         goal = ground if swing_lift is None else ground + swing_lift
+        sensed_height, jumps = goal, None
+        if state.jumps is not None:
+            jumps = self._absorbed(now, goal, state.jumps)
+            goal += jumps.left.value
         gap = goal - before
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         fraction = gate.choose(
@@ -141,11 +184,27 @@ class SlopeTarget(AbstractTarget):
         over_sole = jnp.where(over_sole > 0, over_sole, 0.0)
         deepest = ground - over_sole - self.max_penetration
         height = gate.clip(height, deepest, jnp.full_like(height, jnp.inf), band=HEIGHT_BAND)
-        rise = height - goal
+        rise = height - sensed_height
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)
         limited = now.sensed.bearing * (kept - ankle)
-        return TargetState(height, velocity, foothold.point_ws), rise + limited
+        return TargetState(height, velocity, foothold.point_ws, jumps), rise + limited
+
+    def _absorbed(self, now: SensedMoment, goal: Array, before: Jumps) -> Jumps:
+        """What is left of the jumps of a height, m, after this frame."""
+        dt, until = now.dt, now.sensed.ground.until
+        expected = before.goal + now.sensed.ground_rise + before.goal_velocity * dt
+        change = goal - expected
+        followed = smoothing.fraction_of_half_life(jnp.asarray(FOLLOWED, dt.dtype), dt) * change
+        most = self.max_acceleration * dt * dt
+        followed = jnp.where(followed > most, most, jnp.where(followed < -most, -most, followed))
+        followed = jnp.where(now.started, followed, 0.0)
+        jump = jnp.where(now.started, before.left.value - (change - followed), 0.0)
+        time = jnp.full_like(jump, LATEST)
+        if until is not None:
+            time = jnp.where(until > LATEST, LATEST, jnp.where(until < SOONEST, SOONEST, until))
+        left = smoothing.settle(before.left._replace(value=jump), time, dt)
+        return Jumps(goal, before.goal_velocity + vec.safe_divide(followed, dt), left)
 
     def _climb(self, now: SensedMoment, state: TargetState) -> Float[Array, " legs"]:
         """m, by which the slope rises over each foothold's way since the previous frame."""

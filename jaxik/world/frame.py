@@ -159,6 +159,8 @@ class GroundHits:
     """rad, how much further than animated each foot's toes are up; None is 0."""
     support: Float[Array, " legs"] | None = None
     """0..1, share of each sole that the ground of its foothold supports; None if not looked for."""
+    until: Float[Array, " legs"] | None = None
+    """s, until each foot lands; 0 while it stands. None if that is not known."""
 
 
 @struct

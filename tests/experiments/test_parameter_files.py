@@ -60,7 +60,7 @@ def test_options_are_read_back_and_only_true_or_false(tmp_path):
     text = parameter_files.system_to_toml(ik, Preset("stride"))
     back, _ = parameter_files.load_system(write_file(tmp_path, text))
     on = {name for name, is_on in parameter_tree.options(back).items() if is_on}
-    probe = {"probe.check_support", "probe.remember_swings"}
+    probe = {"probe.check_support", "probe.remember_swings", "target.absorb_jumps"}
     assert on == probe | {"probe.simple_in_flight", "leg.allow_stretch", "foot.bend_toes"}
     assert parameter_tree.options(back).keys() - on == {"probe.limited", "probe.slide_to_support"}
     with pytest.raises(ValueError, match="probe.limited is 0; wanted true or false"):

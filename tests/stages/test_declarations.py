@@ -155,6 +155,7 @@ PitchRollFoot.bend_toes=no PoleLeg.allow_stretch=no PoleLeg.enabled=yes
 PoleLeg.to_hint=no ReachPelvis.spring=no
 RootProbe.check_support=no
 RootProbe.simple_in_flight=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
+SlopeTarget.absorb_jumps=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no
 StrideProbe.simple_in_flight=no StrideProbe.limited=yes
 StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no
