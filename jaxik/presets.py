@@ -215,7 +215,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     return body.scale(ik, rig)
 
 
-def stride(rig: Rig | None = None) -> FootIK:
+def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
     """Foot IK that looks ahead to the next foothold: people on uneven ground.
 
     Each foot goes from the ground of its last foothold to that of its next. The pelvis goes where
@@ -225,15 +225,27 @@ def stride(rig: Rig | None = None) -> FootIK:
     Provide `Frame.stride` if the animation's footholds are known; else they are predicted from the
     character's velocity. On the flat floor for which an animation was made nothing changes.
     Feet turn far enough to walk flat on slopes of 25 degrees.
+
+    Args:
+        rig: whose body it is for; None is the adult.
+        foretold: whether `Frame.stride` tells where feet will stand. If not, that is predicted
+            from each swing so far instead of from each frame alone, feet are sent to ground that
+            holds them, and go on smoothly where a prediction changes.
     """
     ik = FootIK(
         root=KeepRoot(),
         warp=StrideWarp(),
         probe=StrideProbe(
-            max_step_up=0.6, max_step_down=0.6, max_slope=1.05, slide_to_support=True
+            max_step_up=0.6,
+            max_step_down=0.6,
+            max_slope=1.05,
+            # Less steep where a prediction may still change: feet pop less.
+            steepness=1.875 if foretold else 1.6,
+            slide_to_support=True,
+            remember_swings=not foretold,
         ),
         contact=LabelContact(),
-        target=SlopeTarget(max_ankle_height=0.8),
+        target=SlopeTarget(max_ankle_height=0.8, absorb_jumps=not foretold),
         lean=SpineLean(pelvis_rate=body.pitch_rate(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxik.maths import parameter_tree
 from jaxik.maths.struct import struct
-from jaxik.stages.inputs import Inputs, Moment, SensedMoment
+from jaxik.stages.inputs import GroundMoment, Inputs, Moment, SensedMoment
 from jaxik.world import places
 from jaxik.world.frame import Frame, Sensed
 from jaxik.world.skeleton import Rig
@@ -101,9 +101,10 @@ class OneFrame(AbstractFrames):
         return function(self.ik, self.inputs, *others)
 
     def ahead(self, stage: str, sense: OfFrame, *others: PyTree) -> Ahead:
-        now = Moment(self.inputs.frame.dt, self.state.started, self.inputs.gate)
+        inputs = self.inputs
+        now = GroundMoment(inputs.frame.dt, self.state.started, inputs.gate, inputs.terrain)
         with jax.named_scope(stage):
-            sensed = sense(self.ik, self.inputs, *others)
+            sensed = sense(self.ik, inputs, *others)
             return Ahead(*getattr(self.ik, stage).advance(now, sensed, getattr(self.state, stage)))
 
     def advance(self, advance: Advance, sensed: Sensed, ahead: PyTree) -> tuple[State, Advanced]:
@@ -167,14 +168,17 @@ class Clip(AbstractFrames):
             return _MemoryAhead(started, centre_ws, getattr(self.ik, stage).init(rig))
 
         def step(
-            at: Tracks, now: Moment, before: _MemoryAhead, sensed: PyTree, keep: Keep
+            at: Tracks, now: Moment, before: _MemoryAhead, frame: tuple, keep: Keep
         ) -> tuple[_MemoryAhead, Ahead]:
-            after, output = advance(now, sensed, before.memory, at)
+            sensed, *whereabouts = frame
+            ground = self.inputs.ground(*whereabouts)
+            ground_now = GroundMoment(now.dt, now.started, now.gate, ground)
+            after, output = advance(ground_now, sensed, before.memory, at)
             after = keep(_MemoryAhead(jnp.ones_like(now.started), before.centre_ws, after))
             return after, Ahead(after.memory, output)
 
         before = _MemoryAhead(state.started, state.centre_ws, memory)
-        return self._scan(step, begin, before, sensed)[1]
+        return self._scan(step, begin, before, (sensed, frames.platforms, self._centres))[1]
 
     def advance(self, advance: Advance, sensed: Sensed, ahead: PyTree) -> tuple[State, Advanced]:
         def step(

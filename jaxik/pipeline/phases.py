@@ -46,7 +46,7 @@ def watch(ik: FootIK, inputs: Inputs, contact: Contact, turn: Array | None) -> P
     """What the memory of the probe advances with; None if it has none."""
     if not jax.tree.leaves(ik.probe.init(inputs.rig)):
         return None  # and no stride is scaled in vain
-    return ik.probe.watch(_warped(ik, inputs, turn)[0], contact)
+    return ik.probe.watch(_warped(ik, inputs, turn)[0], contact, ik.target.foot_height)
 
 
 def _warped(

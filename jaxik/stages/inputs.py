@@ -71,6 +71,13 @@ class Moment:
 
 
 @struct
+class GroundMoment(Moment):
+    """A moment in which the ground can be looked for: what the stages before the sensing read."""
+
+    terrain: Terrain | LegTerrains
+
+
+@struct
 class SensedMoment(Moment):
     """A moment whose frame has been sensed: what the stages after the contact read."""
 

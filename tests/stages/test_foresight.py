@@ -12,18 +12,19 @@ from jaxik.maths import parameter_tree
 from jaxik.pipeline.frames import Clip
 from jaxik.pipeline.phases import watch
 from jaxik.stages.effector import DirectEffector
+from jaxik.stages.fade import NoFade
 from jaxik.stages.foot import KeepFoot
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.lean import NoLean
 from jaxik.stages.lock import NoLock
-from jaxik.stages.probe.foresight import Swings
+from jaxik.stages.probe.foresight import Foresight
 from jaxik.stages.separation import NoSeparation
 from jaxik.world.frame import Stride
 from jaxik.world.terrain import Terrain
 from reference import characters
 from reference.stages import foresight as reference
 from support.cases import RIG
-from support.clips import assert_close, at, to_frames, to_ik, to_rig, to_terrain
+from support.clips import assert_close, at, to_frames, to_rig, to_terrain
 from support.gradients import finite_jacobian
 from support.probing import level_blocks
 from support.strides import walk
@@ -31,14 +32,17 @@ from support.strides import walk
 COUNT, HALF = 120, 60
 START = (0.0, 0.0, -0.5)
 PREDICTED = dataclasses.replace(  # with few rules beside its probe, so that it compiles soon
-    parameter_tree.with_option(to_ik({}, "stride"), "probe.remember_swings", True),
+    parameter_tree.with_option(jaxik.presets.stride(foretold=False), "probe.limited", False),
     lean=NoLean(),
     lock=NoLock(),
     separation=NoSeparation(),
     effector=DirectEffector(),
     foot=KeepFoot(),
+    fade=NoFade(),
 )
 PREDICTED = parameter_tree.replace(PREDICTED, {"probe.use_strides": False})
+# Feet that land where they are predicted to.
+AS_PREDICTED = parameter_tree.with_option(PREDICTED, "probe.slide_to_support", False)
 STEP = to_terrain(level_blocks((-3.0, 0.3, 0.0), (0.3, 3.0, 0.2)))
 
 
@@ -52,8 +56,8 @@ def run(frames: jaxik.Frame, ground: Terrain = STEP) -> jaxik.Result:
 
 @jax.jit
 def foreseen(
-    ik: jaxik.FootIK, frames: jaxik.Frame, memory: Swings | None = None
-) -> tuple[Swings, Stride]:
+    ik: jaxik.FootIK, frames: jaxik.Frame, memory: Foresight | None = None
+) -> tuple[Foresight, Stride]:
     """What the probe remembers, and the strides by which it goes, in each frame."""
     inputs = Inputs(to_rig(RIG), STEP, frames, jaxik.HARD)
     contacts = jax.vmap(lambda frame: ik.contact.sense(inputs.at(frame)))(frames)
@@ -93,7 +97,9 @@ def test_labelled_footholds_are_not_read():
 def test_footholds_that_are_known_are_as_without_memory():
     frames = frames_of()
     strides = foreseen(parameter_tree.replace(PREDICTED, {"probe.use_strides": True}), frames)[1]
-    assert_close(strides, frames.stride, 1e-12)
+    for field in dataclasses.fields(Stride):
+        assert_close(getattr(strides, field.name), getattr(frames.stride, field.name), 1e-12)
+    assert_close(strides.moved_ws, jnp.zeros_like(strides.moved_ws), 0.0)
 
 
 def flickering(frame: characters.Frame, n: int) -> characters.Frame:
@@ -109,8 +115,9 @@ def test_memory_agrees_with_the_reference():
     frames = walk(RIG, COUNT, start=START, heading=0.3)
     frames = [flickering(frame, n) for n, frame in enumerate(frames)]
     values = {"probe.stance_time": 0.6, "probe.swing_time": 0.4}
-    ik = parameter_tree.replace(PREDICTED, values)
-    swings, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
+    ik = parameter_tree.replace(AS_PREDICTED, values)
+    memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
+    swings = memory.swings
     up = reference.maths.Y
     for leg in range(2):
         before = None
@@ -119,14 +126,15 @@ def test_memory_agrees_with_the_reference():
             before, last, following = reference.follow(values, RIG, frame, leg, planted, up, before)
             assert float(swings.fraction[n, leg]) == pytest.approx(before.fraction, abs=1e-9)
             assert float(swings.time[n, leg]) == pytest.approx(before.time, abs=1e-9)
+            assert float(swings.further[n, leg]) == pytest.approx(before.further, abs=1e-9)
             for got, wanted in ((stride.last_ws, last), (stride.next_ws, following)):
                 np.testing.assert_allclose(got[n, leg, [0, 2]], wanted[[0, 2]], atol=1e-9)
 
 
 def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
     frames = frames_of()
-    swings, stride = jax.tree.map(np.asarray, foreseen(PREDICTED, frames))
-    fraction, swinging = swings.fraction, np.asarray(frames.stride.standing) < 0.5
+    memory, stride = jax.tree.map(np.asarray, foreseen(PREDICTED, frames))
+    fraction, swinging = memory.swings.fraction, np.asarray(frames.stride.standing) < 0.5
     assert (np.diff(fraction, axis=0)[swinging[1:] & swinging[:-1]] >= 0).all()
     # Feet turn otherwise than people's.
     assert np.abs(fraction - np.asarray(frames.stride.fraction))[swinging].mean() < 0.15
@@ -146,7 +154,7 @@ def test_a_clip_resumed_from_the_memory_of_one_of_its_frames_goes_on_as_the_whol
 def next_footholds(times: jax.Array, velocity_ws: jax.Array, still: jax.Array) -> jax.Array:
     """Of a character that walks, or that stands still in the pose of the first frame."""
     names = ("probe.stance_time", "probe.swing_time")
-    ik = parameter_tree.replace(PREDICTED, dict(zip(names, times, strict=True)))
+    ik = parameter_tree.replace(AS_PREDICTED, dict(zip(names, times, strict=True)))
     frames = at(frames_of(), slice(20, 60, 2))
     frames = jax.tree.map(lambda x: jnp.where(still > 0, x[:1], x), frames)
     frames = dataclasses.replace(frames, velocity_ws=velocity_ws)

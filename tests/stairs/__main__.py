@@ -53,7 +53,8 @@ def main() -> int:
     rng = np.random.default_rng(options.seed)
     chosen = [sample(rng, field=number % 2 == 1) for number in range(options.count)]
     begin = time.process_time()
-    verdicts = walked(jaxik.presets.stride(), chosen, known=not options.unknown)
+    ik = jaxik.presets.stride(foretold=not options.unknown)
+    verdicts = walked(ik, chosen, known=not options.unknown)
     print("\n".join(summary(verdicts)), flush=True)
     excess = [max(np.array(verdict) / np.array(BOUNDS)) for _, verdict in verdicts]
     for index in np.argsort(excess)[::-1][: options.worst]:

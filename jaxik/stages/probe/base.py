@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.smoothing import lerp, smoothstep
-from jaxik.stages.inputs import Inputs, Moment
+from jaxik.stages.inputs import GroundMoment, Inputs
 from jaxik.world.frame import (
     FORWARD,
     Contact,
@@ -34,11 +34,13 @@ class AbstractProbe(Rule):
         """Memory before the first frame; None for a probe that goes by each frame alone."""
         return None
 
-    def watch(self, inputs: Inputs, contact: Contact) -> PyTree:
+    def watch(self, inputs: Inputs, contact: Contact, foot_height: Array) -> PyTree:
         """What memory advances with, from this frame alone."""
         return None
 
-    def advance(self, now: Moment, watched: PyTree, state: PyTree) -> tuple[PyTree, Stride | None]:
+    def advance(
+        self, now: GroundMoment, watched: PyTree, state: PyTree
+    ) -> tuple[PyTree, Stride | None]:
         """Memory after this frame, and the stride that `sense` finds in the frame.
 
         It runs before `sense`. None leaves the animation's stride.

@@ -7,8 +7,10 @@ from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import Inputs, Moment
-from jaxik.world.frame import FORWARD, Contact, Stride, animated_ankles
+from jaxik.world.frame import FORWARD, Contact, Frame, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
+
+from .base import foot_heading
 
 TIME_BAND = 0.02  # s
 # How far a swing is when its toes point down most, and when its sole is level again before it
@@ -23,6 +25,10 @@ SETTLED = 0.3  # s, half-life with which a foothold follows a standing ball that
 NEAR = 0.04  # m, from the last foothold, up to which a foot has not left it
 STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
 EARLY, LATE = 0.3, 0.7  # of a swing, between which the foot's own motion takes over from the hip's
+UNSURE, SURE = 0.7, 0.88  # of a swing, between which a foot chooses where it will land
+BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch of the sole
+FARTHEST = 0.15  # of a swing, by which it may differ from these
+FRACTION_BAND = 0.02  # of a swing
 SHORTEST, LONGEST = 0.5, 2.0  # duration of a swing, over the usual one
 
 
@@ -44,8 +50,12 @@ class Feet:
     pitch: Float[Array, " legs"]
     """rad, of the animated sole, toes up."""
     planted: Float[Array, " legs"]
-    stride: Stride
-    """Of the animation."""
+    ahead_ws: Float[Array, "legs 3"]
+    """Unit, horizontal direction of each animated foot."""
+    foot_height: Float[Array, "*legs"]
+    """m, of the ankles over the soles."""
+    frame: Frame
+    rig: Rig
 
 
 @struct
@@ -57,6 +67,10 @@ class Swings:
     """s, since it last stood."""
     fraction: Float[Array, " legs"]
     """0..1, how far the swing is; 0 while it stands."""
+    further: Float[Array, " legs"]
+    """By how much further the swing is where the motion of the ball counts, too."""
+    whole: Float[Array, " legs"]
+    """1 if the swing has been seen from its start, or the foot stands."""
     lowest: Float[Array, " legs"]
     """rad, the lowest pitch of the sole in this swing."""
     travelled_ws: Float[Array, "legs 3"]
@@ -71,10 +85,64 @@ def no_swings(rig: Rig) -> Swings:
     """Memory before the first frame."""
     zero = jnp.zeros_like(rig.side)
     offset = jnp.zeros((*zero.shape, 3), zero.dtype)
-    return Swings(zero, zero, zero, zero, offset, offset, offset[0])
+    return Swings(zero, zero, zero, zero, zero, zero, offset, offset, offset[0])
 
 
-def watch(inputs: Inputs, contact: Contact) -> Feet:
+@struct
+class Plan:
+    """The ground on which each foot will land, and how far it goes aside for that."""
+
+    last_ws: Float[Array, "legs 3"]
+    """m, from where the animated foot stood to its last foothold."""
+    slide: Float[Array, " legs"]
+    """m, ahead, from where the animated foot will stand to the next."""
+    left: smoothing.Deviation
+    """m, m/s and m/s² (legs), what is left of the jumps of that."""
+    moved_ws: Float[Array, "legs 3"]
+    """m, of the foot in this frame from the animated foot."""
+    height: Float[Array, " legs"] = place("leg height")
+    """m, of the tread."""
+    share: Float[Array, " legs"]
+    """0..1, of the sole that the tread supports."""
+    last_share: Float[Array, " legs"]
+    """The same of the last foothold."""
+
+
+def no_plan(rig: Rig) -> Plan:
+    """Memory before the first frame."""
+    zero = jnp.zeros_like(rig.side)
+    offset = jnp.zeros((*zero.shape, 3), zero.dtype)
+    return Plan(offset, zero, smoothing.Deviation(zero, zero, zero), offset, zero, zero, zero)
+
+
+@struct
+class Foresight:
+    """Memory of swings and of where they lead."""
+
+    swings: Swings
+    plan: Plan
+
+
+@struct
+class PlannedStride(Stride):
+    """A stride of feet that were sent to ground that holds them."""
+
+    moved_ws: Float[Array, "legs 3"] | None = None
+    """m, of each foot from the animated one; 0 where the stride is known."""
+    support: Float[Array, " legs"] | None = None
+    """0..1, share of the sole that is supported."""
+    sure: Float[Array, " legs"] | None = None
+    """0..1, how sure the next foothold is."""
+    until: Float[Array, " legs"] | None = None
+    """s, until the foot lands; 0 while it stands."""
+
+
+def sureness(fraction: Array) -> Float[Array, "*b"]:
+    """0..1, how sure it is where a swing lands of which this fraction has passed."""
+    return smoothing.smoothstep((fraction - UNSURE) / (SURE - UNSURE))
+
+
+def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
     """What this frame shows of the feet."""
     frame, up = inputs.frame, inputs.terrain.leg_up_ws
     world, ankle = frame.world_from_model, animated_ankles(frame)
@@ -91,7 +159,10 @@ def watch(inputs: Inputs, contact: Contact) -> Feet:
         ahead=time_ahead(vec.reject(frame.velocity_ws, up), ankle.pos - hip),
         pitch=vec.safe_arctan2(vec.dot(sole, up), vec.length(vec.reject(sole, up))),
         planted=contact.planted,
-        stride=frame.stride,
+        ahead_ws=foot_heading(inputs, up)[0],
+        foot_height=foot_height,
+        frame=frame,
+        rig=inputs.rig,
     )
 
 
@@ -144,7 +215,7 @@ def follow_swings(
     far it is, since the sole turns evenly until it is level again; from then on the swing goes on
     at the pace that it had. At first a foot is expected as far ahead of its hip as it will be when
     it lands, later where its own motion takes it, which slows down as a minimum-jerk motion does
-    (Flash and Hogan 1985).
+    (Flash and Hogan 1985). For how far it still goes, its pace counts as well as its pitch.
 
     Args:
         now: the frame.
@@ -175,10 +246,19 @@ def follow_swings(
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
     fraction = _turned(before.fraction, before.fraction + dt * pace, feet.pitch, lowest, dt)
     fraction = jnp.where(now.started, fraction, guess.fraction)
+    by_motion = _fraction_of_motion(time, travelled, moved, dt) - fraction
+    farthest = jnp.asarray(FARTHEST, dt.dtype)
+    by_motion = gate.clip(by_motion, -farthest, farthest, band=FRACTION_BAND)
+    counts = before.whole * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
+    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
+    further = smoothing.lerp(before.further, BY_MOTION * counts * by_motion, correction)
+    zero = jnp.zeros_like(time)
     swings = Swings(
         feet.planted,
-        gate.choose(feet.planted, jnp.zeros_like(time), time),
-        gate.choose(feet.planted, jnp.zeros_like(fraction), fraction),
+        gate.choose(feet.planted, zero, time),
+        gate.choose(feet.planted, zero, fraction),
+        gate.choose(feet.planted, zero, further),
+        gate.choose(feet.planted, jnp.ones_like(time), before.whole),
         gate.choose(feet.planted, feet.pitch, lowest),
         gate.choose(feet.planted[:, None], in_stance, travelled),
         feet.from_root_ws,
@@ -195,6 +275,12 @@ def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: Abstra
     fraction = jnp.where(landing, LEVEL, guess.fraction)
     since_last = guess.since_last + (fraction - guess.fraction) * swing_time
     return Instant(fraction, since_last, guess.until_next)
+
+
+def time_left(swings: Swings, swing_time: Array) -> Float[Array, " legs"]:
+    """s, until each foot lands; 0 while it stands."""
+    duration = _duration(swings.time, swings.fraction, swing_time)
+    return jnp.where(swings.planted > 0.5, 0.0, (1.0 - swings.fraction) * duration)
 
 
 def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
@@ -221,11 +307,27 @@ def _turned(before: Array, by_time: Array, pitch: Array, lowest: Array, dt: Arra
     return jnp.where(fraction > before, fraction, before)
 
 
+def _fraction_of_motion(time: Array, travelled_ws: Array, moved_ws: Array, dt: Array) -> Array:
+    """How far each swing is, by the speed of its ball over the mean speed so far.
+
+    At the fraction x of a minimum-jerk motion that ratio is `30 (1 - x)^2 / (10 - 15 x + 6 x^2)`,
+    which falls from 3 to 0; x is solved for.
+    """
+    middle_ws, since = travelled_ws - 0.5 * moved_ws, time - 0.5 * dt
+    speed = vec.safe_divide(vec.dot(moved_ws, middle_ws), dt)
+    ratio = 3.0 * smoothing.clip_to_one(
+        vec.safe_divide(speed * since, 3.0 * vec.dot(middle_ws, middle_ws))
+    )
+    root = vec.safe_sqrt(15.0 * ratio * (8.0 - ratio))
+    fraction = (60.0 - 15.0 * ratio - root) / (60.0 - 12.0 * ratio)
+    return fraction * vec.safe_divide(time, since)
+
+
 def _landing(
     feet: Feet, swings: Swings, foot_velocity: Array, stance_time: Array, swing_time: Array
 ) -> Float[Array, "legs 3"]:
     """Where the balls will stand next, m, world space; their height says nothing."""
-    fraction = swings.fraction
+    fraction = LAST * smoothing.clip_to_one((swings.fraction + swings.further) / LAST)
     duration = _duration(swings.time, fraction, swing_time)
     until = (1.0 - fraction) * duration + 0.5 * stance_time
     by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)

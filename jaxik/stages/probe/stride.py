@@ -11,22 +11,25 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, duration, option, ratio, switch, threshold
-from jaxik.maths.smoothing import clip_to_one, lerp, smoothstep
-from jaxik.stages.inputs import Inputs, Moment
+from jaxik.maths.smoothing import Deviation, clip_to_one, lerp, settle, smoothstep
+from jaxik.stages.inputs import GroundMoment, Inputs
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
 from . import foresight
-from .base import make_rays, no_hit
+from .base import foot_heading, make_rays, no_hit
 from .limits import climb, least_rise
-from .support import AbstractSupportedProbe
+from .support import AbstractSupportedProbe, Tread
 from .swing import FAR, Level, s_curve
 
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAIRS = 0.75  # rise over run of the steepest stairs
-SPREAD = 0.5  # of the way that is left: how far around a predicted foothold the foot may land
+STAYS = 2.0  # of a sole, that other ground has to support more than that to which a foot swings
+SOONEST, LATEST = 0.06, 0.2  # s, in which a foot slides to what holds it better
+SPREAD = 0.4  # of the way that is left: how far from a predicted foothold the foot may land
+PLACES = np.array([0.0, -1.0, -0.5, 0.5, 1.0])  # on the way, in parts of that
 
 
 class StrideProbe(AbstractSupportedProbe):
@@ -49,7 +52,8 @@ class StrideProbe(AbstractSupportedProbe):
     `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986). A single frame
     tells little of that. With `remember_swings` on, the last foothold is where the foot stood and
     the next where its swing so far leads (see `foresight`). As long as it is uncertain where that
-    is, the ground is the mean of that for five places around it.
+    is, the ground is the mean of that for five places about it; with `slide_to_support` on, the
+    foot then keeps to the tread on which it will land, and slides aside for that.
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
@@ -99,25 +103,92 @@ class StrideProbe(AbstractSupportedProbe):
     remember_swings: bool = option(
         False,
         "Whether footholds that the animation does not give are predicted from each swing so "
-        "far, which takes memory and five times as many rays, not from each frame alone.",
+        "far, which takes memory and six times as many rays, not from each frame alone.",
     )
 
-    def init(self, rig: Rig) -> foresight.Swings | None:
-        return foresight.no_swings(rig) if self.remember_swings else None
+    def init(self, rig: Rig) -> foresight.Foresight | None:
+        if not self.remember_swings:
+            return None
+        return foresight.Foresight(foresight.no_swings(rig), foresight.no_plan(rig))
 
-    def watch(self, inputs: Inputs, contact: Contact) -> foresight.Feet | None:
-        return foresight.watch(inputs, contact) if self.remember_swings else None
+    def watch(self, inputs: Inputs, contact: Contact, foot_height: Array) -> foresight.Feet | None:
+        return foresight.watch(inputs, contact, foot_height) if self.remember_swings else None
 
     def advance(
-        self, now: Moment, watched: foresight.Feet | None, state: foresight.Swings | None
-    ) -> tuple[foresight.Swings | None, Stride | None]:
+        self,
+        now: GroundMoment,
+        watched: foresight.Feet | None,
+        state: foresight.Foresight | None,
+    ) -> tuple[foresight.Foresight | None, Stride | None]:
         if watched is None or state is None:
             return None, None
         times = self.stance_time, self.swing_time
-        swings, next_ws = foresight.follow_swings(now, watched, state, *times)
-        last_ws = watched.ball_ws - swings.travelled_ws
-        predicted = (last_ws, next_ws, swings.fraction)
-        return swings, self._known_or(watched.stride, *predicted, watched.up_ws)
+        swings, next_ws = foresight.follow_swings(now, watched, state.swings, *times)
+        last_ws, plan = watched.ball_ws - swings.travelled_ws, state.plan
+        until = foresight.time_left(swings, self.swing_time)
+        sure = jnp.zeros_like(until)
+        if self.slide_to_support:
+            place_ws = jnp.where(swings.planted[:, None] > 0.5, last_ws, next_ws)
+            sure = foresight.sureness(swings.fraction)
+            plan = self._plan(now, watched, place_ws, state, swings, until)
+            last_ws += plan.last_ws
+            next_ws += vec.scale(watched.ahead_ws, plan.slide)
+        animated = watched.frame.stride
+        stride = self._known_or(animated, last_ws, next_ws, swings.fraction, watched.up_ws)
+        planned = foresight.PlannedStride(
+            **{field.name: getattr(stride, field.name) for field in dataclasses.fields(stride)},
+            moved_ws=vec.scale(plan.moved_ws, 1.0 - stride.known),
+            support=lerp(plan.last_share, plan.share, self._eased(stride.fraction)),
+            sure=lerp(sure, jnp.ones_like(sure), stride.known),
+            until=until,
+        )
+        return foresight.Foresight(swings, plan), planned
+
+    def _plan(
+        self,
+        now: GroundMoment,
+        feet: foresight.Feet,
+        place_ws: Array,
+        before: foresight.Foresight,
+        swings: foresight.Swings,
+        until: Array,
+    ) -> foresight.Plan:
+        """Where each foot will stand; late in its swing it keeps to the tread that it goes to.
+
+        Args:
+            now: the frame.
+            feet: what it shows.
+            place_ws: where the ball of each foot would stand, m.
+            before: memory.
+            swings: how far the feet are.
+            until: s, until they land.
+        """
+        inputs = Inputs(feet.rig, now.terrain, feet.frame, now.gate)
+        level, plan = Level.of(inputs), before.plan
+        planted, stood = swings.planted > 0.5, before.swings.planted > 0.5
+        swings_on, lands = now.started & ~planted & ~stood, now.started & planted & ~stood
+        origin = vec.dot(level.origin_ws, level.up_ws)
+        sure = jnp.where(planted, 1.0, foresight.sureness(swings.fraction))
+        tread = Tread(plan.height - origin, jnp.where(swings_on, STAYS * sure, 0.0))
+        supports = self.better_support(
+            inputs, level, place_ws[None], feet.foot_height, jnp.ones_like(sure), tread
+        )
+        support = jax.tree.map(lambda x: x[0], supports)
+        slide = sure * support.slide
+        jump = plan.left.value + plan.slide - slide
+        time = jnp.where(until > LATEST, LATEST, jnp.where(until < SOONEST, SOONEST, until))
+        left = settle(plan.left._replace(value=jump), time, now.dt)
+        left = Deviation(*(jnp.where(swings_on, x, 0.0) for x in left))
+
+        first_ws = vec.scale(feet.ahead_ws, jnp.where(planted, slide, 0.0))
+        last_ws = jnp.where(lands[:, None], plan.moved_ws, plan.last_ws)
+        last_ws = jnp.where(now.started, last_ws, first_ws)
+        last_share = jnp.where(lands, plan.share, plan.last_share)
+        last_share = jnp.where(now.started, last_share, support.share)
+        next_ws = vec.scale(feet.ahead_ws, slide + left.value)
+        moved_ws = lerp(last_ws, next_ws, self._eased(swings.fraction)[..., None])
+        height = support.height + origin
+        return foresight.Plan(last_ws, slide, left, moved_ws, height, support.share, last_share)
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         level = Level.of(inputs)
@@ -125,27 +196,35 @@ class StrideProbe(AbstractSupportedProbe):
         stride = inputs.frame.stride if remembered else self._stride(inputs, contact, level)
         support = None
         if self.slide_to_support:
-            slides_ws, supports = self.better_support(inputs, level, stride, foot_height)
-            fraction = self._eased(stride)
-            support = lerp(supports[0], supports[1], fraction)
+            ahead, _ = foot_heading(inputs, level.up_ws)
+            footholds_ws = jnp.stack([stride.last_ws, stride.next_ws])
+            supports = self.better_support(inputs, level, footholds_ws, foot_height, stride.known)
+            slides_ws, shares = vec.scale(ahead, supports.slide), supports.share
+            fraction = self._eased(stride.fraction)
+            support = lerp(shares[0], shares[1], fraction)
             moved_ws = lerp(slides_ws[0], slides_ws[1], fraction[..., None])
             last_ws, next_ws = stride.last_ws + slides_ws[0], stride.next_ws + slides_ws[1]
+            if isinstance(stride, foresight.PlannedStride):
+                assert stride.moved_ws is not None and stride.support is not None
+                moved_ws += stride.moved_ws
+                support = lerp(stride.support, support, stride.known)
             stride = dataclasses.replace(stride, last_ws=last_ws, next_ws=next_ws)
             frame = inputs.frame.with_moved_feet(moved_ws)
             inputs = dataclasses.replace(inputs, frame=frame)
         ground = self._ground_around if remembered else self._ground_of
-        return dataclasses.replace(ground(inputs, foot_height, level, stride), support=support)
+        hits = ground(inputs, foot_height, level, stride)
+        until = stride.until if isinstance(stride, foresight.PlannedStride) else None
+        return dataclasses.replace(hits, support=support, until=until)
 
     def _ground_around(
         self, inputs: Inputs, foot_height: Array, level: Level, stride: Stride
     ) -> GroundHits:
-        """The mean ground of strides to five places, around next footholds that are predicted."""
+        """The mean ground of strides to five places about next footholds that are predicted."""
         ball = inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
         way = vec.reject(stride.next_ws - ball, level.up_ws)
-        aside = vec.cross(way, level.up_ws)
-        spread = jnp.where(stride.known > 0.5, 0.0, SPREAD)
-        ways = jnp.stack([jnp.zeros_like(way), way, -way, aside, -aside])
-        places_ws = stride.next_ws + vec.scale(ways, spread)
+        assert isinstance(stride, foresight.PlannedStride) and stride.sure is not None
+        parts = jnp.asarray(PLACES, way.dtype)[:, None] * SPREAD * (1.0 - stride.sure)
+        places_ws = stride.next_ws + vec.scale(way, parts)
         grounds = jax.vmap(
             lambda next_ws: self._ground_of(
                 inputs, foot_height, level, dataclasses.replace(stride, next_ws=next_ws)
@@ -153,9 +232,9 @@ class StrideProbe(AbstractSupportedProbe):
         )(places_ws)
         return _mean_ground(grounds, level.up_ws)
 
-    def _eased(self, stride: Stride) -> Float[Array, " legs"]:
-        """0..1, how far each foot is from its last foothold to its next, eased in and out."""
-        since_start = stride.fraction - self.rise_start
+    def _eased(self, fraction: Array) -> Float[Array, " legs"]:
+        """0..1, how far feet are from their last foothold to their next, eased in and out."""
+        since_start = fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
         return s_curve(fraction, self.steepness)
 
@@ -181,7 +260,7 @@ class StrideProbe(AbstractSupportedProbe):
         heights = level.height(path.point)
         low, high = heights[0], heights[-1]
         last, next_ = (jax.tree.map(lambda x: x[end], path) for end in (0, -1))  # noqa: B023
-        fraction = self._eased(stride)
+        fraction = self._eased(stride.fraction)
         found = lerp(last.found, next_.found, fraction)  # a foot that stands has no other ground
         # Without a last foothold, the ground is that of the next, or without that the root's level.
         low = lerp(next_.found * high, low, last.found)

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, length, option, ratio
 from jaxik.maths.smoothing import lerp, smoothstep
+from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
-from jaxik.world.frame import Stride
 from jaxik.world.terrain import Hit, cast
 
 from .base import foot_heading
@@ -29,6 +29,29 @@ AHEAD = 0.1  # tenths of the sole, by which a place ahead counts as nearer: no t
 TOO_FAR = 6.0  # of the sole, more than any slide gains
 FIFTH = 0.2  # of the sole, over which slides become too far
 SHARE_BAND = 0.01  # of the sole
+SAME_TREAD = 0.02  # m, from the height of a tread, within which ground is that tread
+
+
+@struct
+class Tread:
+    """Ground on which a foot is already to land."""
+
+    height: Float[Array, " legs"]
+    """m, over the character's level."""
+    preferred: Float[Array, " legs"]
+    """How much more of a sole other ground has to support."""
+
+
+@struct
+class Support:
+    """What supports the sole at a foothold from which it slides."""
+
+    slide: Float[Array, "*b legs"]
+    """m, ahead."""
+    share: Float[Array, "*b legs"]
+    """0..1, of the sole."""
+    height: Float[Array, "*b legs"]
+    """m, of the ground below the ball over the character's level."""
 
 
 class AbstractSupportedProbe(AbstractSwingProbe):
@@ -41,8 +64,8 @@ class AbstractSupportedProbe(AbstractSwingProbe):
     plane, as the stair behind a heel does, counts against the foot four times: on captured people a
     third of a sole hangs over an edge at times, but nothing cuts into it.
 
-    Only footholds that the animation gives are moved: a prediction is off by as much as a slide.
-    In a swing the slide goes from that of the last foothold to that of the next.
+    Footholds that are predicted from a single frame stay: they are off by as much as a slide. In a
+    swing the slide goes from that of the last foothold to that of the next.
     """
 
     layers: Leaf = parameter_tree.layers()
@@ -70,18 +93,23 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         """How much higher and lower than a step the ground may be there, m."""
 
     def better_support(
-        self, inputs: Inputs, level: Level, stride: Stride, foot_height: Array
-    ) -> tuple[Float[Array, "2 legs 3"], Float[Array, "2 legs"]]:
-        """How far each foot slides from its last and its next foothold, and what supports it there.
+        self,
+        inputs: Inputs,
+        level: Level,
+        footholds_ws: Float[Array, "ends legs 3"],
+        foot_height: Array,
+        known: Float[Array, " legs"],
+        tread: Tread | None = None,
+    ) -> Support:
+        """How far each foot slides from footholds to better support.
 
         Args:
             inputs: the frame.
             level: of the character.
-            stride: with the footholds; predicted ones stay.
+            footholds_ws: of the balls, m; their height says nothing.
             foot_height: of the ankles over the soles, m.
-
-        Returns:
-            The slides, m, world space, and the shares of the soles that are supported after them.
+            known: 0..1, whether a leg's feet may slide.
+            tread: what each foot prefers; None has no preference.
         """
         rig, up, gate = inputs.rig, level.up_ws, inputs.gate
         ahead, _ = foot_heading(inputs, up)
@@ -90,7 +118,6 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         sole = self.heel_length + ankle_to_ball + self.toe_length  # m
         tenth = 0.1 * sole
 
-        footholds_ws = jnp.stack([stride.last_ws, stride.next_ws])
         foothold = self.ground_at(inputs, level, footholds_ws)
         margin = self.margin_at(level, footholds_ws)
         # From where a step up from the foothold ends or, without one, from the character's level.
@@ -123,14 +150,17 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         lack = self.min_sole - at(firm) * (share - BLOCKS * blocked)
         detour = jnp.asarray(SLIDE_COST * 0.1 * np.abs(tenths - AHEAD), tenth.dtype)
         too_far = smoothstep((jnp.abs(slide) - self.max_slide) / (FIFTH * sole))
-        too_far = jnp.where(tenths, lerp(jnp.ones_like(too_far), too_far, stride.known), too_far)
+        too_far = jnp.where(tenths, lerp(jnp.ones_like(too_far), too_far, known), too_far)
         cost = jnp.where(lack > 0, lack, 0.0) + detour + TOO_FAR * too_far
-        places = cost, slide, at(firm) * share
+        if tread is not None:
+            off = jnp.abs(at(heights) - tread.height)
+            elsewhere = smoothstep((off - SAME_TREAD) / SAME_TREAD)
+            cost += tread.preferred * (1.0 - at(firm) * (1.0 - elsewhere))
+        places = cost, slide, at(firm) * share, at(heights)
 
         def cheaper(nearer: tuple[Array, ...], farther: tuple[Array, ...]) -> tuple[Array, ...]:
             stays = gate.below(nearer[0], farther[0], band=SHARE_BAND)
             return tuple(gate.choose(stays, *x) for x in zip(nearer, farther, strict=True))
 
         nearest_first = [tuple(x[i] for x in places) for i in SLIDES - SLIDES.min()]
-        _, slide, support = functools.reduce(cheaper, nearest_first)
-        return vec.scale(ahead, slide), support
+        return Support(*functools.reduce(cheaper, nearest_first)[1:])

@@ -23,6 +23,8 @@ class Swing:
     time: float
     fraction: float
     lowest: float
+    further: float
+    whole: bool
     travelled: Array
     ball_from_root: Array
     velocity: Array
@@ -61,6 +63,7 @@ def follow(
         since_last = 0.5 * stance + ahead + fraction * usual
         time, lowest, moved = dt + fraction * usual, pitch, across(velocity * dt, up)
         travelled, smooth = since_last * flat, velocity
+        further, whole = 0.0, False
     else:
         moved = across(from_root - before.ball_from_root + velocity * dt, up)
         travelled = before.travelled + moved
@@ -68,14 +71,19 @@ def follow(
         smooth = before.velocity + smoothing * (velocity - before.velocity)
         time, lowest = before.time + dt, min(before.lowest, pitch)
         fraction = turned(before, dt, pitch, lowest, usual)
+        beyond = clip(by_motion(time, travelled, moved, dt) - fraction, -0.15, 0.15)
+        beyond *= 0.6 * before.whole * smooth01((fraction - 0.3) / 0.15)
+        correction = maths.fraction_of_half_life(0.035, dt)
+        further, whole = lerp(before.further, beyond, correction), before.whole
     if planted:
         if before is None:
             travelled = np.zeros(3)
         elif not before.planted:  # only a foot that comes from elsewhere has a new foothold
             travelled = travelled * (1.0 - smooth01((length(travelled) - 0.04) / 0.04))
         travelled = travelled * (1.0 - maths.fraction_of_half_life(0.3, dt))
-        time, fraction, lowest = 0.0, 0.0, pitch
-    swing = Swing(planted, time, fraction, lowest, travelled, from_root, smooth)
+        time, fraction, lowest, further, whole = 0.0, 0.0, pitch, 0.0, True
+    swing = Swing(planted, time, fraction, lowest, further, whole, travelled, from_root, smooth)
+    fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
     by_hip = hip + smooth * ((1.0 - fraction) * lasts + 0.5 * stance)
     x = max(fraction, 0.3)
@@ -83,6 +91,22 @@ def follow(
     speed = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time
     by_ball = ball + moved / dt * lasts * (1.0 - covered) / speed
     return swing, ball - travelled, by_hip + smooth01((fraction - 0.3) / 0.4) * (by_ball - by_hip)
+
+
+def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
+    """How far a swing of minimum jerk is that has this speed, by bisection."""
+    middle, since = travelled - 0.5 * moved, time - 0.5 * dt
+    if not middle @ middle > 0.0:
+        return 1.0 * time / since  # 30 (1 - x)^2 is 0
+    wanted = clip(float(moved @ middle) / dt * since / float(middle @ middle), 0.0, 3.0)
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        x = 0.5 * (low + high)
+        if 30 * (1 - x) ** 2 > wanted * (10 - 15 * x + 6 * x**2):
+            low = x
+        else:
+            high = x
+    return low * time / since
 
 
 def turned(before: Swing, dt: float, pitch: float, lowest: float, usual: float) -> float:
