@@ -72,7 +72,7 @@ def _aval(atom: Var | Literal) -> ShapedArray:
     return cast(ShapedArray, atom.aval)
 
 
-def _unbatched(equation: JaxprEqn) -> Function:
+def function_of(equation: JaxprEqn) -> Function:
     """One equation as a function."""
     primitive = equation.primitive
 
@@ -126,7 +126,7 @@ class BatchEvaluator:
     def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         name = equation.primitive.name
         if not any(_batched(values)):
-            return [Value(x, False) for x in _unbatched(equation)(*_arrays(values))]
+            return [Value(x, False) for x in function_of(equation)(*_arrays(values))]
         reads, rule = RULES.get(name, ("", BatchEvaluator._vmap))
         known = set(reads.split()) <= equation.params.keys()
         return rule(self, equation, values) if known else self._vmap(equation, values)
@@ -134,7 +134,7 @@ class BatchEvaluator:
     def _vmap(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         """JAX's own rule: while loops, dot products, sorting, and what is not known here."""
         axes = tuple(-1 if value.batched else None for value in values)
-        results = jax.vmap(_unbatched(equation), in_axes=axes, out_axes=-1)(*_arrays(values))
+        results = jax.vmap(function_of(equation), in_axes=axes, out_axes=-1)(*_arrays(values))
         return [Value(x, True) for x in results]
 
     def _broadcast(self, values: Sequence[Value]) -> list[Array]:
@@ -151,10 +151,10 @@ class BatchEvaluator:
         shape = (*_aval(equation.outvars[0]).shape, self.size)
         # A scalar operand may stand beside arrays.
         xs = [jnp.broadcast_to(x, shape) for x in self._broadcast(values)]
-        return [Value(x, True) for x in _unbatched(equation)(*xs)]
+        return [Value(x, True) for x in function_of(equation)(*xs)]
 
     def _along_axes(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        return [Value(x, True) for x in _unbatched(equation)(*self._broadcast(values))]
+        return [Value(x, True) for x in function_of(equation)(*self._broadcast(values))]
 
     def _broadcast_in_dim(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         shape = _aval(equation.outvars[0]).shape
@@ -233,7 +233,7 @@ class BatchEvaluator:
 
         @function.defjvp
         def _(primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
-            jvp = functools.partial(jax.jvp, _unbatched(equation))
+            jvp = functools.partial(jax.jvp, function_of(equation))
             results = evaluate(jax.make_jaxpr(jvp)(examples, examples), (*primals, *tangents))
             return results[: len(results) // 2], results[len(results) // 2 :]
 

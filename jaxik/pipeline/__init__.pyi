@@ -4,6 +4,7 @@ from . import frames as frames
 from . import packing as packing
 from . import phases as phases
 from . import preconditions as preconditions
+from . import requests as requests
 from . import shapes as shapes
 from . import simulation as simulation
 from . import system as system
@@ -12,6 +13,7 @@ from .preconditions import check as check
 from .simulation import resume as resume
 from .simulation import run as run
 from .simulation import step as step
+from .simulation import step_and_rays as step_and_rays
 from .system import Corrections as Corrections
 from .system import FootIK as FootIK
 from .system import Result as Result

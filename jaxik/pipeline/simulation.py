@@ -12,11 +12,12 @@ from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Frame
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import LegTerrains, Terrain
+from jaxik.world.terrain import GivenHits, Hit, LegTerrains, Terrain
 
 from .faults import Faults, clean
 from .frames import Clip, OneFrame, Tracks, read_tracks
 from .phases import solve
+from .requests import OpenProgram, Request, casting, joined, open_terrain, reading
 from .shapes import check_inputs, check_state, with_floats_of
 from .system import FootIK, Result, State, init
 
@@ -45,7 +46,8 @@ def step(
     Args:
         ik: the system; its float leaves are its parameters.
         rig: the legs.
-        terrain: the terrain, world space; `LegTerrains` where legs differ in their up.
+        terrain: the terrain, world space; `LegTerrains` where legs differ in their up, and
+            `jaxik.world.terrain.from_hits` where somebody else casts the rays.
         state: memory, from `init` or from the previous step.
         frame: the animation. A leg or a frame with numbers that are not finite stays as animated,
             is `faulty` in the result, and leaves no trace in the memory. A `dt` of 0 or less is a
@@ -61,12 +63,63 @@ def step(
 
     Raises:
         ValueError: if an array has a shape that does not fit the legs of the rig, or is that of
-            several characters, or the memory is that of another system; it says which.
+            several characters, or the memory is that of another system, or there are hits of other
+            rays than the system casts; it says which.
     """
     inputs = Inputs(rig, terrain, frame, gate)
     check_inputs(ik, inputs, clip=False)
-    after, result = solve(OneFrame.after(*_start(ik, inputs, state, checked)))
+    if isinstance(terrain.body, GivenHits):
+        program = open_step(ik, inputs, state, checked=checked)
+        program.check(terrain.body.hits)
+        after, result = program(reading(terrain.body.hits), ik, inputs, state)
+    else:
+        after, result = _solve(ik, inputs, state, checked)
     return after, result if trace else dataclasses.replace(result, trace=None)
+
+
+@_jit()
+def step_and_rays(
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    state: State,
+    frame: Frame,
+    gate: AbstractGate = HARD,
+) -> tuple[State, Result, Request, Hit]:
+    """`step`, and its rays with what they hit, as `jaxik.world.terrain.from_hits` wants it.
+
+    For the arguments see `step`; the terrain is none of given hits.
+
+    Returns:
+        Memory after the frame, the result, all rays (rays) in order, and their hits.
+
+    Raises:
+        ValueError: as `step`.
+    """
+    inputs = Inputs(rig, open_terrain(terrain), frame, gate)
+    check_inputs(ik, inputs, clip=False)
+    program = open_step(ik, inputs, state)
+    cast, rays = casting(terrain.at(frame.platforms)), []
+
+    def answer(request: Request, number: int) -> Hit:
+        rays.append((request, cast(request, number)))
+        return rays[-1][1]
+
+    after, result = program(answer, ik, inputs, state)
+    return after, dataclasses.replace(result, trace=None), *joined(rays)
+
+
+def open_step(ik: FootIK, inputs: Inputs, state: State, *, checked: bool = False) -> OpenProgram:
+    """`step` of these arguments, whose terrain is `GivenHits`, traced: it returns its trace, too.
+
+    Others answer its requests of rays when it is called, with the system, inputs and memory.
+    """
+    return OpenProgram(functools.partial(_solve, checked=checked), ik, inputs, state)
+
+
+def _solve(ik: FootIK, inputs: Inputs, state: State, checked: bool) -> tuple[State, Result]:
+    """One frame, of arguments whose shapes are right."""
+    return solve(OneFrame.after(*_start(ik, inputs, state, checked)))
 
 
 @_jit(static_argnames="checked")

@@ -117,7 +117,7 @@ class Mesh(AbstractSurface):
         if self.offset_ws is not None:
             a, b, c = (corner + self.offset_ws for corner in (a, b, c))
         normal = vec.triangle_normal(a, b, c, up_ws)
-        distance = _plane_distance(origins_ws, up_ws, a, normal)
+        distance = plane_distance(origins_ws, up_ws, a, normal)
         # A ray that rounding lets in lies just outside its triangle, which a steep plane turns into
         # a large error: the value is clipped to the corners, the gradient stays that of the plane.
         drops = [vec.dot(origins_ws - corner, up_ws) for corner in (a, b, c)]
@@ -177,16 +177,16 @@ class MovingSurface(AbstractSurface):
             start = jax.lax.stop_gradient(start)
             drop, normal, hit = self.surface.intersect(start, self.up_ps, mask)
             touched = start - vec.scale(self.up_ps, drop)
-            distance = _plane_distance(origins, up, touched, normal)
+            distance = plane_distance(origins, up, touched, normal)
             start = origins + vec.scale(self.up_ps - up, distance)
         return distance, normal, hit & (vec.dot(normal, up) > 0)
 
 
-def _plane_distance(
+def plane_distance(
     origins: Float[Array, "*b 3"],
     up: Float[Array, "3"],
     point: Float[Array, "*#b 3"],
     normal: Float[Array, "*#b 3"],
 ) -> Float[Array, "*b"]:
-    """Distance along -up to a plane; 0 where the plane contains up."""
+    """Distance of points along -up to a plane, m; 0 where the plane contains up."""
     return vec.safe_divide(vec.dot(origins - point, normal), vec.dot(up, normal))

@@ -65,6 +65,16 @@ class Terrain:
         """The terrain moved by `by_ws`, m, with the platforms where they are now."""
         return Terrain(self.up_ws, tuple(surface.moved(by_ws) for surface in self.surfaces))
 
+    def first_hits(
+        self,
+        origins_ws: Float[Array, "*b 3"],
+        reach: Float[Array, "*#b"],
+        mask: UInt[Array, "*#b"],
+        moves: bool,
+    ) -> Hit:
+        """What `cast` gives for these rays; `moves` is whether hits have platforms."""
+        return _nearest(self, origins_ws, reach, mask, moves)
+
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"], surface: int = 0) -> "Terrain":
         """This terrain with moved vertices in one of its meshes; see `Mesh.with_vertices`.
 
@@ -140,10 +150,10 @@ def cast(
     reach, mask = jnp.asarray(reach, origins_ws.dtype), jnp.asarray(mask, jnp.uint32)
     moves = terrain.platform_count > 0
     if isinstance(terrain, Terrain):
-        return _nearest(terrain, origins_ws, reach, mask, moves)
+        return terrain.first_hits(origins_ws, reach, mask, moves)
     reach, mask = (jnp.broadcast_to(x, origins_ws.shape[:-1]) for x in (reach, mask))
     hits = [
-        _nearest(ground, origins_ws[..., leg, :], reach[..., leg], mask[..., leg], moves)
+        ground.first_hits(origins_ws[..., leg, :], reach[..., leg], mask[..., leg], moves)
         for leg, ground in enumerate(terrain.legs)
     ]
     axis = origins_ws.ndim - 2

@@ -1,0 +1,159 @@
+"""Rays that a traced program requests, and programs that go on with what somebody answers."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+from jaxtyping import Array, Float, PyTree, UInt
+
+from jaxik.batching.primitives import function_of
+from jaxik.maths.struct import struct
+from jaxik.world.terrain import GivenHits, Hit, LegTerrains, Terrain
+from jaxik.world.terrain.given import BODY, request_p
+
+
+@struct
+class Request:
+    """Rays that somebody is to cast, world space."""
+
+    origins_ws: Float[Array, "*b 3"]
+    """Metres."""
+    up_ws: Float[Array, "*b 3"]
+    """Unit; each ray runs along its opposite."""
+    length: Float[Array, "*b"]
+    """Metres."""
+    layers: UInt[Array, "*b"]
+    """The layers that each ray can hit, one bit per layer."""
+
+
+Answer: TypeAlias = Callable[[Request, int], Hit]
+"""What rays hit, by the number of the leg on whose ground they fall, or `given.BODY`."""
+
+
+class OpenProgram:
+    """A function, traced, that leaves it to others to cast the rays onto its `GivenHits`."""
+
+    def __init__(self, function: Callable, *args: PyTree) -> None:
+        """Traces the function of these arguments, or of their shapes."""
+        self._traced, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        self._structure = jax.tree.structure(shapes)
+
+    @property
+    def requests(self) -> list[Request]:
+        """Its requests in order: of each, the shapes of the rays."""
+        return [
+            Request(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in request.invars))
+            for request in _requests(self._traced)
+        ]
+
+    @property
+    def ray_count(self) -> int:
+        """How many rays it requests."""
+        return sum(math.prod(request.length.shape) for request in self.requests)
+
+    def check(self, hits: Hit | None) -> None:
+        """Refuses hits of other rays than it requests.
+
+        Raises:
+            ValueError: saying how many there are.
+        """
+        count = None if hits is None else len(hits.found)
+        if count != self.ray_count:
+            held = "no hits" if count is None else f"the hits of {count} rays"
+            raise ValueError(
+                f"terrain has {held}, and the system casts {self.ray_count} in a frame; "
+                "jaxik.pipeline.step_and_rays tells which"
+            )
+
+    def __call__(self, answer: Answer, *args: PyTree) -> Any:
+        """What the function returns if its requests, one by one, are answered in this way."""
+        results = _evaluate(self._traced, jax.tree.leaves(args), answer)
+        return jax.tree.unflatten(self._structure, results)
+
+
+def open_terrain(terrain: Terrain | LegTerrains) -> Terrain | LegTerrains:
+    """Ground with the same directions and platforms, onto which somebody else casts."""
+    platforms = terrain.platform_count
+    body = GivenHits(terrain.up_ws, (), None, BODY, platforms)
+    if isinstance(terrain, Terrain):
+        return body
+    legs = enumerate(terrain.legs)
+    return LegTerrains(
+        body, tuple(GivenHits(ground.up_ws, (), None, leg, platforms) for leg, ground in legs)
+    )
+
+
+def reading(hits: Hit) -> Answer:
+    """Answers with hits of all rays (rays), in the order of the requests."""
+    start = 0
+
+    def answer(request: Request, number: int) -> Hit:
+        nonlocal start
+        shape = request.length.shape
+        rows = slice(start, start + math.prod(shape))
+        start = rows.stop
+        return jax.tree.map(lambda leaf: leaf[rows].reshape(*shape, *leaf.shape[1:]), hits)
+
+    return answer
+
+
+def joined(casts: Sequence[tuple[Request, Hit]]) -> tuple[Request, Hit]:
+    """The rays of several casts, and what they hit, one after another (rays)."""
+
+    def join(*leaves: Array) -> Array:
+        pairs = zip(leaves, casts, strict=True)
+        flat = [leaf.reshape(-1, *leaf.shape[rays.length.ndim :]) for leaf, (rays, _) in pairs]
+        return jnp.concatenate(flat)
+
+    return jax.tree.map(join, *casts)
+
+
+def casting(terrain: Terrain | LegTerrains) -> Answer:
+    """Answers with what the rays hit of a terrain whose platforms are in place."""
+
+    def answer(request: Request, number: int) -> Hit:
+        ground = terrain.body if number == BODY else terrain.legs[number]  # type: ignore[union-attr]
+        rays = request.origins_ws, request.length, request.layers
+        return ground.first_hits(*rays, terrain.platform_count > 0)
+
+    return answer
+
+
+def _requests(traced: ClosedJaxpr | Jaxpr) -> list[JaxprEqn]:
+    """The equations that request rays, in their order."""
+    requests = []
+    for equation in _jaxpr(traced).eqns:
+        if equation.primitive is request_p:
+            requests.append(equation)
+        elif equation.primitive.name == "jit":
+            requests += _requests(equation.params["jaxpr"])
+    return requests
+
+
+def _jaxpr(traced: ClosedJaxpr | Jaxpr) -> Jaxpr:
+    return getattr(traced, "jaxpr", traced)
+
+
+def _evaluate(traced: ClosedJaxpr | Jaxpr, values: list, answer: Answer) -> list:
+    jaxpr = _jaxpr(traced)
+    known = dict(zip(jaxpr.constvars, getattr(traced, "consts", ()), strict=True))
+    known |= zip(jaxpr.invars, values, strict=True)
+
+    def read(atom: Var | Literal) -> Any:
+        return atom.val if isinstance(atom, Literal) else known[atom]
+
+    for equation in jaxpr.eqns:
+        operands = [read(atom) for atom in equation.invars]
+        if equation.primitive is request_p:
+            hit = answer(Request(*operands), equation.params["ground"])
+            results = [hit.point, hit.normal, hit.found, hit.platform][: len(equation.outvars)]
+        elif equation.primitive.name == "jit" and _requests(equation.params["jaxpr"]):
+            results = _evaluate(equation.params["jaxpr"], operands, answer)
+        else:
+            results = function_of(equation)(*operands)
+        typed = zip(equation.outvars, results, strict=True)
+        known |= {var: jnp.asarray(result, var.aval.dtype) for var, result in typed}
+    return [read(atom) for atom in jaxpr.outvars]
