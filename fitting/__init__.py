@@ -5,8 +5,8 @@ posterior, and writes reports; the command `jaxik` does the same from a shell. I
 (that is `jaxik`), not a motion editor and not a renderer.
 
 Start with `fit`: it takes an experiment, which `load_experiment` reads from a file. The rooms, each
-importing only those before it: `runtime`, `clips`, `ground`, `synthetic`, `problem`, `inference`,
-`motion`, `experiment`, `report`, `studies`, `viewer`, `jobs`, `bench`, `cli`.
+importing only those before it: `runtime`, `codegen`, `clips`, `ground`, `synthetic`, `problem`,
+`inference`, `motion`, `experiment`, `report`, `studies`, `viewer`, `jobs`, `bench`, `cli`.
 """
 
 import lazy_loader

@@ -1,6 +1,7 @@
 from . import bench as bench
 from . import cli as cli
 from . import clips as clips
+from . import codegen as codegen
 from . import experiment as experiment
 from . import ground as ground
 from . import inference as inference
@@ -16,6 +17,8 @@ from .clips import Clip as Clip
 from .clips import load_clip as load_clip
 from .clips import save_clip as save_clip
 from .clips.clip_frames import frames_from_clip as frames_from_clip
+from .codegen.export import GoldenTrace as GoldenTrace
+from .codegen.export import export_c as export_c
 from .experiment.experiment import Experiment as Experiment
 from .experiment.experiment_files import load_experiment as load_experiment
 from .experiment.in_memory import clip_entry as clip_entry
@@ -27,6 +30,7 @@ from .jobs import calibrate as calibrate
 from .jobs import calibrate_wrong_model as calibrate_wrong_model
 from .jobs import compare as compare
 from .jobs import export as export
+from .jobs import export_code as export_code
 from .jobs import fit as fit
 from .jobs import fit_many as fit_many
 from .jobs import population as population

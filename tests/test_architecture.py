@@ -15,8 +15,8 @@ ROOT = house.ROOT
 WINGS = {  # in import order: a wing may import those before it
     "jaxik": ["batching", "maths", "world", "solvers", "stages", "pipeline", "presets", "record"],
     "fitting": [
-        "runtime", "clips", "ground", "synthetic", "problem", "inference", "motion", "experiment",
-        "report", "studies", "viewer", "jobs", "bench", "cli",
+        "runtime", "codegen", "clips", "ground", "synthetic", "problem", "inference", "motion",
+        "experiment", "report", "studies", "viewer", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
 STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "separation"]

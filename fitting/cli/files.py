@@ -18,6 +18,7 @@ from .options import (
     clip_options,
     command,
     compiled,
+    count,
     flag,
     group,
     number,
@@ -247,25 +248,68 @@ record = Command(
     ),
     output("FILE", ".toml, .json, .csv or .bin"),
     argument(
-        "--as", dest="system", choices=("ozz", "unreal", "mec"),
-        help="write the settings of this system (default: parameters, or a record)",
+        "--as", dest="form", choices=("ozz", "unreal", "mec", "c"),
+        help="write the settings of this system, or C code (default: parameters, or a record)",
     ),
     flag("--drop", "leave out what the record or settings cannot hold"),
+    group(
+        "of C code",
+        argument(
+            "--trace", type=Path, metavar="CLIP",
+            help="also write what the system makes of this clip, and check.c, which replays it",
+        ),
+        argument(
+            "--terrain", type=Path, metavar="MESH",
+            help="under that clip: .ply, .obj, .glb, ..., or heights as .npz, .npy, .png",
+        ),
+        argument(
+            "--legs", type=count(1, 64), metavar="N",
+            help="of a character (default: those of the clip, or 2)",
+        ),
+        argument("--name", metavar="NAME", help="prefix of all names (default: footik)"),
+    ),
 )  # fmt: skip
 def export(options: argparse.Namespace) -> int:
-    """Write parameters as TOML, JSON, the game's record, or settings.
+    """Write parameters as TOML, JSON, the game's record, settings or C code.
 
     jaxik export runs/walk -o walk.json               parameters under our names
     jaxik export runs/walk -o footik.bin              the game's record, or as .csv
     jaxik export runs/walk --as unreal -o walk.csv    settings under Unreal's names, in cm
     jaxik export walk.csv -o parameters.toml          and back
+    jaxik export runs/walk --as c -o walk             the system itself, as C code
+    jaxik export runs/walk --as c -o walk --trace walk.bvh --terrain steps.obj
 
     What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
     it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's
-    inspector, as .toml, .json or .csv.
+    inspector, as .toml, .json or .csv. C code needs no library, and its header says how an engine
+    calls it and casts its rays.
     """
     from fitting import jobs
 
-    jobs.export(options.source, options.output, system=options.system, drop=options.drop)
+    code = {name: getattr(options, name) for name in ("trace", "terrain", "legs", "name")}
+    wanted = [f"--{name}" for name, value in code.items() if value is not None]
+    if options.form == "c":
+        _export_code(options)
+    elif wanted:
+        raise ValueError(f"{', '.join(wanted)}: only for C code; wanted --as c as well")
+    else:
+        jobs.export(options.source, options.output, system=options.form, drop=options.drop)
     print(f"written to {options.output}")
     return 0
+
+
+def _export_code(options: argparse.Namespace) -> None:
+    from fitting import jobs
+    from fitting.studies.animations import AnimationFiles
+
+    if options.drop:
+        raise ValueError("--drop: only for a record and for settings; C code holds everything")
+    if (options.trace is None) != (options.terrain is None):
+        raise ValueError("--trace and --terrain belong together: a clip and the ground under it")
+    if options.trace is not None and options.legs is not None:
+        raise ValueError("--legs: a trace has the legs of its clip; leave out one of the two")
+    trace = None if options.trace is None else AnimationFiles(options.trace, options.terrain)
+    jobs.export_code(
+        options.source, options.output,
+        name=options.name or "footik", legs=options.legs or 2, trace=trace,
+    )  # fmt: skip

@@ -11,6 +11,9 @@ from typing import NamedTuple
 
 import fitting
 import jaxik
+from fitting.clips.clip_frames import frames_from_clip
+from fitting.codegen.export import GoldenTrace, export_c
+from fitting.codegen.program import blank_rig
 from fitting.experiment import originals, parameter_files, record_files
 from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.systems import Preset
@@ -20,6 +23,7 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import check_keys, error_context
 from jaxik import record
 
+from .animations import AnimationFiles
 from .fit import run_folder
 
 OURS = (".toml", ".json", ".csv", ".bin")  # parameters, parameters, record, record
@@ -79,6 +83,40 @@ def export(
             files.write_text(output, record.to_csv([content]))
         else:
             files.write(output, lambda path: path.write_bytes(record.to_bytes(content)))
+
+
+def export_code(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    name: str = "footik",
+    legs: int = 2,
+    trace: AnimationFiles | None = None,
+) -> None:
+    """Writes a system as C code with the answers of `jaxik.step`; see `fitting.codegen`.
+
+    Args:
+        source: as for `export`.
+        folder: where the files go; it is made if missing.
+        name: of the files, and prefix of all names in them.
+        legs: how many legs a character has; with a trace, as many as in its clip.
+        trace: a clip and its terrain, of which a golden trace is written, with `check.c`, a program
+            that replays it; None writes neither.
+
+    Raises:
+        ValueError: the source or the clip cannot be read, the system cannot be exported, or the
+            folder cannot be made.
+    """
+    run_folder.check_output_folder(Path(folder))
+    loaded = load(Path(source))
+    if trace is None:
+        rig, golden = blank_rig(legs), None
+    else:
+        rig = trace.flat_clip.rig
+        frames = frames_from_clip(trace.flat_clip, floor=trace.floor)
+        golden = GoldenTrace(trace.load_terrain(), frames)
+    with error_context(source):
+        export_c(loaded.ik, rig, folder, name=name, golden=golden)
 
 
 def load(source: Path) -> Source:

@@ -68,7 +68,8 @@ def _values(arrays: Sequence[ArrayLike], batched: Sequence[bool]) -> list[Value]
     return [Value(*pair) for pair in zip(arrays, batched, strict=True)]
 
 
-def _aval(atom: Var | Literal) -> ShapedArray:
+def aval_of(atom: Var | Literal) -> ShapedArray:
+    """The shape and type of a value."""
     return cast(ShapedArray, atom.aval)
 
 
@@ -148,7 +149,7 @@ class BatchEvaluator:
         ]
 
     def _elementwise(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        shape = (*_aval(equation.outvars[0]).shape, self.size)
+        shape = (*aval_of(equation.outvars[0]).shape, self.size)
         # A scalar operand may stand beside arrays.
         xs = [jnp.broadcast_to(x, shape) for x in self._broadcast(values)]
         return [Value(x, True) for x in function_of(equation)(*xs)]
@@ -157,7 +158,7 @@ class BatchEvaluator:
         return [Value(x, True) for x in function_of(equation)(*self._broadcast(values))]
 
     def _broadcast_in_dim(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        shape = _aval(equation.outvars[0]).shape
+        shape = aval_of(equation.outvars[0]).shape
         axes = (*equation.params["broadcast_dimensions"], len(shape))
         return [Value(lax.broadcast_in_dim(values[0].array, (*shape, self.size), axes), True)]
 
@@ -166,7 +167,7 @@ class BatchEvaluator:
         return [Value(lax.concatenate(self._broadcast(values), axis), True)]
 
     def _reshape(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        shape = _aval(equation.outvars[0]).shape
+        shape = aval_of(equation.outvars[0]).shape
         return [Value(lax.reshape(values[0].array, (*shape, self.size)), True)]
 
     def _transpose(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
@@ -218,7 +219,7 @@ class BatchEvaluator:
 
     def _custom_jvp(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         """Keeps the function's own derivative rule, evaluated for the batch as well."""
-        avals = [_aval(atom) for atom in equation.invars]
+        avals = [aval_of(atom) for atom in equation.invars]
         if not all(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals):
             return self._vmap(equation, values)
         examples = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
@@ -294,7 +295,7 @@ class BatchEvaluator:
 def _count_sliced(outer: Sequence[Var | Literal], inner: Sequence[ShapedArray]) -> int:
     """How many values of a scan its body sees one slice of."""
     pairs = zip(outer, inner, strict=True)
-    return sum(len(_aval(whole).shape) > len(part.shape) for whole, part in pairs)
+    return sum(len(aval_of(whole).shape) > len(part.shape) for whole, part in pairs)
 
 
 Rule: TypeAlias = Callable[[BatchEvaluator, JaxprEqn, list[Value]], list[Value]]

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import Array, Float, PyTree, UInt
 
-from jaxik.batching.primitives import function_of
+from jaxik.batching.primitives import aval_of, function_of
 from jaxik.maths.struct import struct
 from jaxik.world.terrain import GivenHits, Hit, LegTerrains, Terrain
 from jaxik.world.terrain.given import BODY, request_p
@@ -45,7 +45,7 @@ class OpenProgram:
     def requests(self) -> list[Request]:
         """Its requests in order: of each, the shapes of the rays."""
         return [
-            Request(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in request.invars))
+            Request(*(cast(Any, aval_of(atom)) for atom in request.invars))
             for request in _requests(self._traced)
         ]
 
@@ -54,19 +54,19 @@ class OpenProgram:
         """How many rays it requests."""
         return sum(math.prod(request.length.shape) for request in self.requests)
 
-    def check(self, hits: Hit | None) -> None:
-        """Refuses hits of other rays than it requests.
+    def checked(self, hits: Hit | None) -> Hit:
+        """The hits, if they are of as many rays as it requests.
 
         Raises:
             ValueError: saying how many there are.
         """
-        count = None if hits is None else len(hits.found)
-        if count != self.ray_count:
-            held = "no hits" if count is None else f"the hits of {count} rays"
+        if hits is None or len(hits.found) != self.ray_count:
+            held = "no hits" if hits is None else f"the hits of {len(hits.found)} rays"
             raise ValueError(
                 f"terrain has {held}, and the system casts {self.ray_count} in a frame; "
                 "jaxik.pipeline.step_and_rays tells which"
             )
+        return hits
 
     def __call__(self, answer: Answer, *args: PyTree) -> Any:
         """What the function returns if its requests, one by one, are answered in this way."""
@@ -134,7 +134,7 @@ def _requests(traced: ClosedJaxpr | Jaxpr) -> list[JaxprEqn]:
 
 
 def _jaxpr(traced: ClosedJaxpr | Jaxpr) -> Jaxpr:
-    return getattr(traced, "jaxpr", traced)
+    return cast(Jaxpr, getattr(traced, "jaxpr", traced))
 
 
 def _evaluate(traced: ClosedJaxpr | Jaxpr, values: list, answer: Answer) -> list:
@@ -155,5 +155,5 @@ def _evaluate(traced: ClosedJaxpr | Jaxpr, values: list, answer: Answer) -> list
         else:
             results = function_of(equation)(*operands)
         typed = zip(equation.outvars, results, strict=True)
-        known |= {var: jnp.asarray(result, var.aval.dtype) for var, result in typed}
+        known |= {var: jnp.asarray(result, aval_of(var).dtype) for var, result in typed}
     return [read(atom) for atom in jaxpr.outvars]

@@ -70,8 +70,8 @@ def step(
     check_inputs(ik, inputs, clip=False)
     if isinstance(terrain.body, GivenHits):
         program = open_step(ik, inputs, state, checked=checked)
-        program.check(terrain.body.hits)
-        after, result = program(reading(terrain.body.hits), ik, inputs, state)
+        hits = program.checked(terrain.body.hits)
+        after, result = program(reading(hits), ik, inputs, state)
     else:
         after, result = _solve(ik, inputs, state, checked)
     return after, result if trace else dataclasses.replace(result, trace=None)

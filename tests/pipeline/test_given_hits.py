@@ -1,5 +1,7 @@
 """Hits that somebody else gives: they replay a motion, and the wrong ones are refused."""
 
+# pyright: reportArgumentType=false
+
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import equinox as eqx
 import jax
@@ -125,7 +125,7 @@ request_p = Primitive("request_rays")
 request_p.multiple_results = True
 
 
-def _refuse(*_: Any, **__: Any) -> NoReturn:
+def _refuse(*_: object, **__: object) -> NoReturn:
     raise ValueError(
         "only jaxik.step reads hits that are given, one frame at a time; cast, run and loops of "
         "rays need a terrain"
@@ -134,13 +134,13 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 @request_p.def_abstract_eval
 def _(
-    origins: ShapedArray, up: ShapedArray, length: ShapedArray, layers: ShapedArray, **params: Any
+    origins: ShapedArray, up: ShapedArray, length: ShapedArray, layers: ShapedArray, **params: int
 ) -> list[ShapedArray]:
     platform = [ShapedArray(length.shape, jnp.dtype(jnp.int32))] if params["moves"] else []
     return [origins, up, length, *platform]
 
 
-def _batched(values: Sequence[Array], axes: Sequence[int | None], **params: Any) -> tuple:
+def _batched(values: Sequence[Array], axes: Sequence[int | None], **params: int) -> tuple:
     size = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
     rows = [
         jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)

@@ -1,0 +1,328 @@
+"""The functions of a program in C99 that is also C++11."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number
+from .program import Place, Program
+from .schedule import Part, Schedule, Target
+
+WIDTH = 110  # of an expression, from which it gets a name of its own
+C_TYPES = {FLOAT: "float", INT: "int", UNSIGNED: "unsigned", BOOL: "int"}
+LETTERS = {FLOAT: "f", INT: "i", UNSIGNED: "u", BOOL: "b"}
+
+# By operation and type of the operands: an expression of these, or a call of one of HELPERS.
+EXPRESSIONS: dict[tuple[str, str], str] = {
+    **{(name, FLOAT): f"({{0}} {sign} {{1}})" for name, sign in (
+        ("add", "+"), ("subtract", "-"), ("multiply", "*"), ("divide", "/"),
+    )},
+    **{(name, kind): f"({{0}} {sign} {{1}})" for name, sign in (
+        ("LT", "<"), ("LE", "<="), ("EQ", "=="), ("NE", "!="),
+    ) for kind in (FLOAT, INT, UNSIGNED, BOOL)},
+    **{(name, kind): f"({{0}} {sign} {{1}})" for name, sign in (
+        ("and", "&"), ("or", "|"), ("xor", "^"),
+    ) for kind in (INT, UNSIGNED, BOOL)},
+    **{(name, UNSIGNED): f"({{0}} {sign} {{1}})" for name, sign in (
+        ("add", "+"), ("subtract", "-"), ("multiply", "*"),
+    )},
+    # In unsigned numbers, since C leaves open what too large signed ones become.
+    **{(name, INT): f"(int)((unsigned){{0}} {sign} (unsigned){{1}})" for name, sign in (
+        ("add", "+"), ("subtract", "-"), ("multiply", "*"),
+    )},
+    ("negate", FLOAT): "(-{0})",
+    ("negate", UNSIGNED): "(0u - {0})",
+    ("negate", INT): "(int)(0u - (unsigned){0})",
+    ("abs", FLOAT): "fabsf({0})",
+    ("abs", INT): "@abs_int({0})",
+    ("sign", FLOAT): "@sign({0})",
+    ("sign", INT): "(({0} > 0) - ({0} < 0))",
+    ("maximum", FLOAT): "@maximum({0}, {1})",
+    ("minimum", FLOAT): "@minimum({0}, {1})",
+    **{("maximum", kind): "({0} > {1} ? {0} : {1})" for kind in (INT, UNSIGNED)},
+    **{("minimum", kind): "({0} < {1} ? {0} : {1})" for kind in (INT, UNSIGNED)},
+    ("maximum", BOOL): "({0} | {1})",
+    ("minimum", BOOL): "({0} & {1})",
+    ("remainder", FLOAT): "fmodf({0}, {1})",
+    ("sqrt", FLOAT): "@root({0})",
+    ("rsqrt", FLOAT): "(1.0f / @root({0}))",
+    ("cbrt", FLOAT): "cbrtf({0})",
+    ("exponential", FLOAT): "expf({0})",
+    ("exponential_minus_one", FLOAT): "expm1f({0})",
+    ("log", FLOAT): "logf({0})",
+    ("log_plus_one", FLOAT): "log1pf({0})",
+    ("power", FLOAT): "powf({0}, {1})",
+    ("cosine", FLOAT): "cosf({0})",
+    ("sine", FLOAT): "sinf({0})",
+    ("tan", FLOAT): "tanf({0})",
+    ("tanh", FLOAT): "tanhf({0})",
+    ("atan2", FLOAT): "atan2f({0}, {1})",
+    ("floor", FLOAT): "floorf({0})",
+    ("ceil", FLOAT): "ceilf({0})",
+    ("round_nearest_even", FLOAT): "@round_even({0})",
+    ("is_finite", FLOAT): "(({0} - {0}) == 0.0f)",
+    ("not", BOOL): "(!{0})",
+    ("not", INT): "(~{0})",
+    ("not", UNSIGNED): "(~{0})",
+    ("shift_left", UNSIGNED): "({1} < 32u ? {0} << {1} : 0u)",
+    ("shift_left", INT): "(int)((unsigned){1} < 32u ? (unsigned){0} << {1} : 0u)",
+    ("shift_right_logical", UNSIGNED): "({1} < 32u ? {0} >> {1} : 0u)",
+    ("shift_right_logical", INT): "(int)((unsigned){1} < 32u ? (unsigned){0} >> {1} : 0u)",
+    ("shift_right_arithmetic", INT): "@shift_signed({0}, {1})",
+    **{("select", kind): "({0} ? {1} : {2})" for kind in (FLOAT, INT, UNSIGNED, BOOL)},
+    ("float_of_bool", BOOL): "({0} ? 1.0f : 0.0f)",
+    ("float_of_int", INT): "(float){0}",
+    ("float_of_unsigned", UNSIGNED): "(float){0}",
+    ("int_of_bool", BOOL): "{0}",
+    ("int_of_float", FLOAT): "@int_of({0})",
+    ("int_of_unsigned", UNSIGNED): "(int){0}",
+    ("unsigned_of_bool", BOOL): "(unsigned){0}",
+    ("unsigned_of_float", FLOAT): "@unsigned_of({0})",
+    ("unsigned_of_int", INT): "(unsigned){0}",
+    ("float_of_bits", UNSIGNED): "@float_of_bits({0})",
+    ("lesser", FLOAT): "@lesser({0}, {1})",
+    ("greater", FLOAT): "@greater({0}, {1})",
+    ("sign_bit", FLOAT): "(@bits_of_float({0}) >> 31 != 0u)",
+    ("copysign", FLOAT): "copysignf({0}, {1})",
+    ("bits_of_float", FLOAT): "@bits_of_float({0})",
+}  # fmt: skip
+"""The @ becomes the prefix of all names."""
+
+HELPERS = {
+    "abs_int": "static int @abs_int(int x) { return x < 0 ? (int)(0u - (unsigned)x) : x; }",
+    "root": """\
+static float @root(float x) {
+#ifdef @SSE /* where sqrtf may set errno, which costs a fifth of the code */
+    return _mm_cvtss_f32(_mm_sqrt_ss(_mm_set_ss(x)));
+#else
+    return sqrtf(x);
+#endif
+}""",
+    "sign": "static float @sign(float x) { return x > 0 ? 1.0f : x < 0 ? -1.0f : x; }",
+    "lesser": "static float @lesser(float a, float b) { return a < b ? a : b; }",
+    "greater": "static float @greater(float a, float b) { return a > b ? a : b; }",
+    "maximum": "static float @maximum(float a, float b) { return a > b || a != a ? a : b; }",
+    "minimum": "static float @minimum(float a, float b) { return a < b || a != a ? a : b; }",
+    "round_even": """\
+static float @round_even(float x) {
+    const float large = 8388608.0f; /* from here on every number is whole */
+    return fabsf(x) < large ? copysignf((fabsf(x) + large) - large, x) : x;
+}""",
+    "shift_signed": """\
+static int @shift_signed(int x, int count) {
+    const unsigned places = (unsigned)count < 31u ? (unsigned)count : 31u;
+    return x < 0 ? ~(~x >> places) : x >> places;
+}""",
+    "int_of": """\
+static int @int_of(float x) {
+    if (x != x) return 0;
+    return x >= 2147483648.0f ? 2147483647 : x < -2147483648.0f ? -2147483647 - 1 : (int)x;
+}""",
+    "unsigned_of": """\
+static unsigned @unsigned_of(float x) {
+    if (!(x > 0)) return 0;
+    return x >= 4294967296.0f ? 4294967295u : (unsigned)x;
+}""",
+    "float_of_bits": """\
+static float @float_of_bits(unsigned bits) {
+    float x;
+    unsigned char *to = (unsigned char *)&x;
+    const unsigned char *from = (const unsigned char *)&bits;
+    unsigned i;
+    for (i = 0; i < sizeof x; i++) to[i] = from[i];
+    return x;
+}""",
+    "bits_of_float": """\
+static unsigned @bits_of_float(float x) {
+    unsigned bits;
+    unsigned char *to = (unsigned char *)&bits;
+    const unsigned char *from = (const unsigned char *)&x;
+    unsigned i;
+    for (i = 0; i < sizeof x; i++) to[i] = from[i];
+    return bits;
+}""",
+}
+ARGUMENTS = {  # of the functions, by the name with which an expression begins
+    "parameters": "const @parameters *parameters",
+    "rig": "const @rig *rig",
+    "state": "const @state *state",
+    "frame": "const @frame *frame",
+    "hits": "const @hit *hits",
+    "work": "@work *work",
+    "rays": "@ray *rays",
+    "after": "@state *after",
+    "result": "@result *result",
+}
+
+
+def literal(value: Number) -> str:
+    """A number in C."""
+    kind = value.dtype.kind
+    if kind == "f":
+        if np.isnan(value):
+            return "NAN"
+        if np.isinf(value):
+            return "INFINITY" if value > 0 else "(-INFINITY)"
+        text = str(value)
+        text = f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+    elif kind == "u":
+        text = f"{value}u"
+    elif value == np.iinfo(np.int32).min:
+        text = "-2147483647 - 1"
+    else:
+        text = str(int(value))
+    return f"({text})" if text.startswith("-") else text
+
+
+def functions(program: Program, schedule: Schedule) -> list[str]:
+    """The helpers, the parts of all phases, and the functions that others call.
+
+    Raises:
+        ValueError: an operation on a type for which there is no expression.
+    """
+    parts, calls, number = [], [], 0
+    for phase in schedule.phases:
+        calls.append([])
+        for part in phase:
+            text, arguments = _Function(program, part).write(f"@part_{number}")
+            parts.append(text)
+            calls[-1].append((f"@part_{number}", arguments))
+            number += 1
+    bodies = "".join(parts)
+    helpers = [text for helper, text in HELPERS.items() if f"@{helper}(" in bodies]
+    return [*helpers, *parts, *_entries(calls)]
+
+
+def signature(phase: int, rounds: int) -> str:
+    """The head of the function of a phase."""
+    inputs = [ARGUMENTS[name] for name in ("parameters", "rig")]
+    if phase == 0:
+        return f"void @init({', '.join([*inputs, '@state *state'])})"
+    inputs += [ARGUMENTS["state"], ARGUMENTS["frame"]]
+    hits = [ARGUMENTS["hits"]] if phase > 1 else []
+    if phase <= rounds:
+        more = [*inputs, *hits, ARGUMENTS["work"], ARGUMENTS["rays"]]
+        return f"void @rays_{phase}({', '.join(more)})"
+    inputs[2] = "@state *state"
+    more = [*inputs, *hits, ARGUMENTS["work"], ARGUMENTS["result"]]
+    return f"void @step({', '.join(more)})"
+
+
+def _entries(calls: Sequence[Sequence[tuple[str, list[str]]]]) -> Iterator[str]:
+    """The functions that others call."""
+    rounds = len(calls) - 2
+    for phase, parts in enumerate(calls):
+        head = signature(phase, rounds)
+        stateful = phase in (0, rounds + 1)
+        names = re.findall(r"\*(\w+)[,)]", head)
+        used = {argument for _, arguments in parts for argument in arguments}
+        lines = [f"    (void){name};" for name in names if name not in used and name != "state"]
+        if "state" not in used and not stateful:
+            lines.append("    (void)state;")
+        lines += [
+            f"    {part}({', '.join(_passed(phase, arguments))});" for part, arguments in parts
+        ]
+        if stateful:
+            local = ["    @state after;"]
+            lines = [*local, *lines, "    *state = after;"]
+        yield "\n".join([f"{head} {{", *lines, "}"])
+
+
+def _passed(phase: int, arguments: Sequence[str]) -> list[str]:
+    return ["&after" if argument == "after" else argument for argument in arguments]
+
+
+class _Function:
+    """One part as a function."""
+
+    def __init__(self, program: Program, part: Part) -> None:
+        self.program, self.graph, self.part = program, program.graph, part
+        self.uses = Counter(node for node in part.writes)
+        for node in part.nodes:
+            twice = EXPRESSIONS[self._key(node)].count("{0}") > 1
+            self.uses.update((*self.graph.operands[node],) * (2 if twice else 1))
+        self.uses.update(node for _, node in part.targets)
+        self.texts: dict[Node, str] = {}
+        self.lines: list[str] = []
+
+    def write(self, name: str) -> tuple[str, list[str]]:
+        """The function, and the names of its arguments."""
+        for node in self.part.nodes:
+            operands = [self._text(operand) for operand in self.graph.operands[node]]
+            text = EXPRESSIONS[self._key(node)].format(*operands)
+            single = self.uses[node] == 1 and node not in self.part.writes
+            self.texts[node] = text if single and len(text) < WIDTH else self._named(node, text)
+        for target, node in self.part.targets:
+            self.lines.append(f"{self._target(target)} = {_bare(self._text(node))};")
+        for node, place in self.part.writes.items():
+            self.lines.append(
+                f"work->{LETTERS[self.graph.types[node]]}[{place}] = {self.texts[node]};"
+            )
+        body = "\n".join(f"    {line}" for line in self.lines)
+        names = [word for word in ARGUMENTS if re.search(rf"\b{word}(->|\[)", body)]
+        heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
+        return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
+
+    def _key(self, node: Node) -> tuple[str, str]:
+        operation, operands = self.graph.operations[node], self.graph.operands[node]
+        key = operation, self.graph.types[operands[-1]]
+        if key not in EXPRESSIONS:
+            raise ValueError(
+                f"C has no rule for the operation {key[0]!r} on numbers of type {key[1]}"
+            )
+        return key
+
+    def _text(self, node: Node) -> str:
+        """An expression for a node that is there."""
+        if node not in self.texts:
+            if (value := self.graph.values[node]) is not None:
+                self.texts[node] = literal(value)
+            else:
+                if node in self.graph.inputs:
+                    text = _input(self.program.inputs[self.graph.inputs[node]])
+                else:
+                    place = self.part.reads[node]
+                    text = f"work->{LETTERS[self.graph.types[node]]}[{place}]"
+                self.texts[node] = self._named(node, text) if self.uses[node] > 1 else text
+        return self.texts[node]
+
+    def _named(self, node: Node, text: str) -> str:
+        kind = self.graph.types[node]
+        name = f"{LETTERS[kind]}{len(self.lines)}"
+        self.lines.append(f"const {C_TYPES[kind]} {name} = {_bare(text)};")
+        return name
+
+    def _target(self, target: Target) -> str:
+        if target.struct == "rays":
+            axis = f"[{target.axis}]" if target.name in ("origin", "direction") else ""
+            return f"rays[{target.number}].{target.name}{axis}"
+        struct = "state" if target.struct == "init" else target.struct
+        place = self.program.places[struct][target.number]
+        return _member("after" if struct == "state" else struct, place)
+
+
+def _bare(text: str) -> str:
+    """An expression without parentheses around all of it."""
+    if not text.startswith("("):
+        return text
+    depth = 0
+    for position, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0:
+            return text[1:-1] if position == len(text) - 1 else text
+    return text
+
+
+def _input(place: Place) -> str:
+    if place.struct == "hits":
+        ray, *axis = place.index
+        text = f"hits[{ray}].{place.field.path[0]}" + "".join(f"[{i}]" for i in axis)
+    else:
+        text = _member(place.struct, place)
+    return f"({text} != 0)" if place.field.kind == BOOL else text
+
+
+def _member(struct: str, place: Place) -> str:
+    return f"{struct}->{'.'.join(place.field.path)}" + "".join(f"[{i}]" for i in place.index)

@@ -1,0 +1,69 @@
+"""`jaxik export --as c`: files, a trace that a C program replays, and mistakes in one line."""
+
+import subprocess
+
+import pytest
+
+from fitting.cli import main
+from fitting.clips import load_clip, save_clip
+from fitting.codegen import toolchain
+from support.commands import refusal
+from support.experiments import ROOT
+
+BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
+GROUND = ROOT / "data" / "terrains" / "slope.ply"
+
+
+@pytest.fixture
+def parameters(tmp_path):
+    path = tmp_path / "system.toml"
+    path.write_text('preset = "unreal"\nfaithful = true\n[contact]\nidle_speed = 9.0\n')
+    return path
+
+
+def test_a_trace_of_a_clip_is_replayed_by_a_program_in_c(tmp_path, parameters, capsys):
+    folder, clip = tmp_path / "code", load_clip(BASE)
+    save_clip(tmp_path / "walk.npz", clip.select(slice(0, 5)))
+    words = ["export", parameters, "--as", "c", "-o", folder, "--name", "walker"]
+    words += ["--trace", tmp_path / "walk.npz", "--terrain", GROUND]
+    assert main.main([str(word) for word in words]) == 0
+    assert f"written to {folder}" in capsys.readouterr().out
+    files = {"walker.h", "walker.c", "check.c", "trace.bin"}
+    assert {path.name for path in folder.iterdir()} == files
+    assert len((folder / "check.c").read_text().splitlines()) < 60
+    compiler = toolchain.compiler("c")
+    if compiler is None:
+        pytest.skip("needs a compiler of C: none in $CC, no cc")
+    build = [compiler, "-Wall", "-Wextra", "-Werror", "walker.c", "check.c", "-lm", "-o", "check"]
+    subprocess.run(build, cwd=folder, check=True)
+    done = subprocess.run(["./check"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith("5 frames, largest difference ")
+    damaged = bytearray((folder / "trace.bin").read_bytes())
+    damaged[-40:-36] = b"\0\0\0\x42"  # a number of the last result
+    (folder / "trace.bin").write_bytes(damaged)
+    assert subprocess.run(["./check"], cwd=folder, capture_output=True).returncode == 1
+
+
+def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, parameters):
+    main.main(["export", str(parameters), "--as", "c", "-o", str(tmp_path), "--legs", "1"])
+    header, code = ((tmp_path / f"footik.{kind}").read_text() for kind in "hc")
+    assert "#define FOOTIK_LEGS 1\n" in header
+    assert "Foot IK of 1 leg, made by jaxik" in header and "contact StandingContact" in header
+    assert "/* m/s, 0 to 3: Speed of the character up to" in " ".join(header.split())
+    assert "9.0f /* idle_speed */" in code
+    assert "/* m, hip to knee. */\n    float thigh[1];" in header
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--legs", "2"], "--legs: only for C code; wanted --as c as well"),
+        (["--as", "c", "--drop"], "--drop: only for a record and for settings"),
+        (["--as", "c", "--trace", BASE], "--trace and --terrain belong together"),
+        (["--as", "c", "--name", "Walk!"], "name is 'Walk!'; wanted small letters, digits and"),
+        (["--as", "c", "--trace", BASE, "--terrain", GROUND, "--legs", "3"], "--legs: a trace has"),
+    ],
+)
+def test_mistakes_cost_a_line(words, message, tmp_path, parameters, capsys):
+    line = refusal(["export", parameters, "-o", tmp_path / "code", *words], tmp_path, capsys)
+    assert message in line
