@@ -24,6 +24,9 @@ from scipy.optimize import OptimizeResult
 import jaxik
 from fitting.clips import edit
 from fitting.clips.clip_frames import frames_from_clip
+from fitting.codegen import toolchain
+from fitting.codegen.export import export_c
+from fitting.codegen.toolchain import Compiled, Playback
 from fitting.experiment.problems import ClipData
 from fitting.experiment.systems import Preset
 from fitting.ground import meshes
@@ -69,6 +72,9 @@ WAITS = {
     "fit": "`jaxik fit`, its first cost",
     "sample": "`jaxik sample`, its first state of the chain",
 }
+
+FRAMES = {"record": 4.0, "stride": 12.0}  # µs, aims of a frame in C
+LARGEST_CODE = 300.0  # kB, aim
 
 RATE = 30.0  # Hz, of the clip whose parameters are dragged
 TARGET = 100.0  # ms, from which a drag feels slow
@@ -278,6 +284,39 @@ def step(measurement: Measurement, sizes: Sizes) -> None:
     for name in grounds:
         what, note = f"the compiled program, {name}", "called with the leaves of its arguments"
         measurement.add_timing(f"{name}, program", what, "µs", note=note)
+
+
+def export(measurement: Measurement, sizes: Sizes) -> None:
+    """Presets as C code: a frame on one core, without its rays, the code's size, and its making."""
+    compiler = toolchain.compiler()
+    if compiler is None:
+        measurement.notes.append("no C compiler: $CC is not set, and there is no cc")
+        return
+    rig, frames = workloads.exported_walk()
+    frame, calls = jax.tree.map(lambda leaf: leaf[0], frames), {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in sizes.exported:
+            ik, place = workloads.single(getattr(jaxik.presets, name)(rig)), Path(folder, name)
+            start = time.perf_counter()
+            program = export_c(ik, rig, place, name=name, frame=frame)
+            generated = time.perf_counter()
+            compiled = Compiled(program, place, name, [compiler, *toolchain.FLAGS])
+            seconds = {"generate": generated - start, "compile": time.perf_counter() - generated}
+            hits = workloads.hits_at_random(len(frames.dt), program.ray_count)
+            calls[name] = Playback(compiled, (ik, rig), frames, hits)
+            for word, value in seconds.items():
+                measurement.add(f"{name}: {word}", value, "s")
+            size = toolchain.code_size(compiler, place, name) / 1e3
+            measurement.add(f"{name}: machine code", size, "kB", at_most=LARGEST_CODE)
+        measurement.time_in_turns(calls)
+    for name, call in calls.items():
+        program = call.program
+        counts = [len(rays) for rays in program.rounds]
+        note = f"{program.legs} legs; rays of each round: {', '.join(map(str, counts))}"
+        measurement.add_timing(
+            name, f"{name}: a frame", "µs",
+            items=len(frames.dt), at_most=FRAMES.get(name), note=note,
+        )  # fmt: skip
 
 
 def rays(measurement: Measurement, sizes: Sizes) -> None:
@@ -809,6 +848,7 @@ BENCHMARKS = {
     "legs": Benchmark("two-bone legs, corrections out", "float32", legs),
     "feet": Benchmark("feet: two-bone, ankle, updated transforms", "float32", feet),
     "step": Benchmark("one frame of one character, dispatch included", "float32", step),
+    "export": Benchmark("systems as C code, one core, rays aside", "float32", export),
     "rays": Benchmark("rays against Embree", "float32", rays),
     "crowd": Benchmark("the record pipeline for a crowd", "float32", crowd),
     "gradient": Benchmark("its gradient, in reverse", "float32", gradient),

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 import jaxik
 from fitting.clips import clip_frames, load_clip, save_clip
 from fitting.clips.clip import Clip
+from fitting.codegen.trace import with_restart
 from fitting.experiment.problems import ClipData, make_scene
 from fitting.ground import meshes
 from fitting.problem.problem import Problem
@@ -27,6 +28,7 @@ from fitting.synthetic.walker import Slide, Slip
 from jaxik.maths import parameter_tree, quat
 from jaxik.world import terrain
 from jaxik.world.frame import Sensed
+from jaxik.world.terrain import Hit
 
 Tree = TypeVar("Tree", bound=PyTree)
 
@@ -108,6 +110,24 @@ def ray_origins(count: int) -> Float[np.ndarray, "rays 3"]:
     origins = np.random.default_rng(1).uniform(0.0, EXTENT, (count, 3))
     origins[:, 1] = 5.0
     return origins.astype(np.float32)
+
+
+def exported_walk() -> tuple[jaxik.Rig, jaxik.Frame]:
+    """The legs and frames of a walk, in 32 bits, as C code takes them."""
+    clip = walk(120)
+    rig, frames = single((clip.rig, clip_frames.frames_from_clip(clip)))
+    return rig, with_restart(frames)
+
+
+def hits_at_random(frame_count: int, rays: int) -> Hit:
+    """Hits (frames, rays) of uneven ground, so that decisions are as hard to foresee as there."""
+    random, shape = np.random.default_rng(3), (frame_count, rays)
+    points = np.zeros((*shape, 3), np.float32)
+    points[..., 1] = random.normal(0.0, 0.03, shape)
+    normals = random.normal((0.0, 1.0, 0.0), 0.1, (*shape, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    whole = np.ones(shape, np.float32)
+    return Hit(*map(jnp.asarray, (points, normals, whole, whole)))
 
 
 def tiled(motion: jaxik.Frame, count: int) -> jaxik.Frame:
@@ -358,6 +378,8 @@ class Sizes:
     """Of the sampler."""
     chains: int = 1
     """Samples of the sampler."""
+    exported: tuple[str, ...] = ("mec", "ozz", "record", "stride", "unreal")
+    """Presets as C code."""
     # Sizes of the scaling curves.
     batches: tuple[int, ...] = (2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
     """Legs."""
@@ -375,7 +397,7 @@ class Sizes:
 FULL = Sizes()
 QUICK = Sizes(
     repeats=3, characters=64, derived=64, cells=200, rays=200_000, read=1 << 24, crowd_repeats=2,
-    fits=1, cold=False, floats=("float64",), steps=20,
+    fits=1, cold=False, floats=("float64",), steps=20, exported=("mec", "record"),
     batches=(100, 1000, 10_000), lengths=(100, 1000), grids=(22, 71), parameters=(5, 20),
     legs_each=(2, 4), devices=(1, 2), clips=(10, 100), workers=(1, 2),
 )  # fmt: skip

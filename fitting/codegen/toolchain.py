@@ -134,6 +134,7 @@ class Playback:
         missing = [None] if starts is None else []
         self._arguments = [*pointers[:-3], *missing, ctypes.c_int(count), *pointers[-3:]]
         self._compiled = compiled
+        self.program = program
 
     def __call__(self) -> None:
         """Computes all frames."""
@@ -141,7 +142,7 @@ class Playback:
 
     def outputs(self) -> Outputs:
         """What the last call has computed."""
-        trees = self._compiled.program.trees
+        trees = self.program.trees
         states, words, results = self._outputs
         words = words.reshape(len(words), -1, RAY)
         floats = words.view(np.float32)

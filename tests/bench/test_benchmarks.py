@@ -19,6 +19,7 @@ from fitting.bench.roofline import Work
 from fitting.bench.workloads import Sizes
 from fitting.cli import main
 from fitting.clips.clip_frames import frames_from_clip
+from fitting.codegen import toolchain
 from fitting.inference.optimise.search import find_best_fit
 from fitting.runtime import machine
 from fitting.runtime.threads import usable_cores
@@ -325,6 +326,24 @@ def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs,
     for our_rot, their_rot in zip(ours, theirs, strict=True):
         assert_close(np.abs(np.sum(our_rot * their_rot, axis=-1)), np.ones(200), 1e-4)
         assert np.ptp(our_rot[:, 0]) > 1e-3  # the legs differ
+
+
+def test_exported_systems_have_their_time_their_size_and_their_targets(monkeypatch):
+    monkeypatch.setattr(toolchain, "FLAGS", ("-O0",))
+    if toolchain.compiler() is None:
+        pytest.skip("needs a compiler of C: none in $CC, no cc")
+    timings = measure("export", exported=("unreal",))
+    rows = figures(timings)
+    assert list(rows) == [f"unreal: {what}" for what in (
+        "generate", "compile", "machine code", "a frame",
+    )]  # fmt: skip
+    assert (
+        rows["unreal: machine code"].at_most == 300.0
+        and "rays of each round: 4, 12" in rows["unreal: a frame"].note
+    )
+    monkeypatch.setattr(toolchain, "compiler", lambda: None)
+    timings = measure("export")
+    assert not timings.figures and "no C compiler" in timings.notes[0]
 
 
 def test_rays_are_compared_with_embree_where_it_is_installed(monkeypatch):

@@ -404,6 +404,7 @@ RANGES = {  # by command, with other words that it needs
     "translate --from mec --to record --clip a --terrain b -o out":
         {"--fps": ("1", "1000")} | OF_CLIPS | OF_TERRAINS,
     "inspect walk.bvh": OF_CLIPS,
+    "export run -o out": {"--legs": ("1", "64")},
     "terrain walk.bvh -o hill.ply": {"--margin": ("0", "100")} | OF_CLIPS,
     "record show footik.bin": OF_RECORDS,
     "record to-toml footik.bin -o out": OF_RECORDS,
