@@ -3,11 +3,13 @@
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from string import ascii_lowercase
 
 import numpy as np
 
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number
 from .program import Place, Program
+from .repeats import Cone, Repeats
 from .schedule import Part, Schedule, Target
 
 WIDTH = 110  # of an expression, from which it gets a name of its own
@@ -182,11 +184,13 @@ def functions(program: Program, schedule: Schedule) -> list[str]:
     Raises:
         ValueError: an operation on a type for which there is no expression.
     """
-    parts, calls, number = [], [], 0
+    parts, calls, number, repeats = [], [], 0, schedule.repeats
+    for cone in repeats.functions:
+        parts.append(_shared(program, cone, len(parts)))
     for phase in schedule.phases:
         calls.append([])
         for part in phase:
-            text, arguments = _Function(program, part).write(f"@part_{number}")
+            text, arguments = _Function(program, part, repeats).write(f"@part_{number}")
             parts.append(text)
             calls[-1].append((f"@part_{number}", arguments))
             number += 1
@@ -237,23 +241,20 @@ def _passed(phase: int, arguments: Sequence[str]) -> list[str]:
 class _Function:
     """One part as a function."""
 
-    def __init__(self, program: Program, part: Part) -> None:
-        self.program, self.graph, self.part = program, program.graph, part
+    def __init__(self, program: Program, part: Part, repeats: Repeats) -> None:
+        self.program, self.graph, self.part, self.repeats = program, program.graph, part, repeats
         self.uses = Counter(node for node in part.writes)
         for node in part.nodes:
-            twice = EXPRESSIONS[self._key(node)].count("{0}") > 1
-            self.uses.update((*self.graph.operands[node],) * (2 if twice else 1))
+            operands = repeats.operands(self.graph, node)
+            twice = self._expression(node).count("{0}") > 1
+            self.uses.update(operands * (2 if twice else 1))
         self.uses.update(node for _, node in part.targets)
         self.texts: dict[Node, str] = {}
         self.lines: list[str] = []
 
     def write(self, name: str) -> tuple[str, list[str]]:
         """The function, and the names of its arguments."""
-        for node in self.part.nodes:
-            operands = [self._text(operand) for operand in self.graph.operands[node]]
-            text = EXPRESSIONS[self._key(node)].format(*operands)
-            single = self.uses[node] == 1 and node not in self.part.writes
-            self.texts[node] = text if single and len(text) < WIDTH else self._named(node, text)
+        self.compute()
         for target, node in self.part.targets:
             self.lines.append(f"{self._target(target)} = {_bare(self._text(node))};")
         for node, place in self.part.writes.items():
@@ -265,14 +266,26 @@ class _Function:
         heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
         return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
 
-    def _key(self, node: Node) -> tuple[str, str]:
+    def compute(self) -> None:
+        """Writes what computes all nodes, but for the expressions of those that are used once."""
+        for node in self.part.nodes:
+            operands = map(self._text, self.repeats.operands(self.graph, node))
+            text = self._expression(node).format(*operands)
+            single = self.uses[node] == 1 and node not in self.part.writes
+            self.texts[node] = text if single and len(text) < WIDTH else self._named(node, text)
+
+    def _expression(self, node: Node) -> str:
+        if node in self.repeats.calls:
+            number, arguments = self.repeats.calls[node]
+            places = ", ".join(f"{{{place}}}" for place in range(len(arguments)))
+            return f"@shared_{number}({places})"
         operation, operands = self.graph.operations[node], self.graph.operands[node]
         key = operation, self.graph.types[operands[-1]]
         if key not in EXPRESSIONS:
             raise ValueError(
                 f"C has no rule for the operation {key[0]!r} on numbers of type {key[1]}"
             )
-        return key
+        return EXPRESSIONS[key]
 
     def _text(self, node: Node) -> str:
         """An expression for a node that is there."""
@@ -301,6 +314,21 @@ class _Function:
         struct = "state" if target.struct == "init" else target.struct
         place = self.program.places[struct][target.number]
         return _member("after" if struct == "state" else struct, place)
+
+
+def _shared(program: Program, cone: Cone, number: int) -> str:
+    """What occurs often as a function."""
+    types = program.graph.types
+    function = _Function(program, Part(list(cone.nodes), []), Repeats([], {}))
+    heads = []
+    for letter, argument in zip(ascii_lowercase, cone.arguments, strict=False):
+        function.texts[argument] = letter
+        heads.append(f"{C_TYPES[types[argument]]} {letter}")
+    function.compute()
+    lines = [*function.lines, f"return {_bare(function.texts[cone.nodes[-1]])};"]
+    body = "\n".join(f"    {line}" for line in lines)
+    kind = C_TYPES[types[cone.nodes[-1]]]
+    return f"@APART static {kind} @shared_{number}({', '.join(heads)}) {{\n{body}\n}}"
 
 
 def _bare(text: str) -> str:

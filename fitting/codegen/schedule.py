@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from .graph import CONSTANT, INPUT, Graph, Node
+from .repeats import Repeats, find
 
 LONGEST = 1500
 
@@ -45,6 +46,8 @@ class Part:
 class Schedule:
     """All parts."""
 
+    repeats: Repeats
+    """What has a function of its own."""
     phases: list[list[Part]]
     memory: Counter[str]
     """How many places of each type there are."""
@@ -52,9 +55,11 @@ class Schedule:
 
 def plan(graph: Graph, phases: Sequence[Sequence[tuple[Target, Node]]]) -> Schedule:
     """The parts in which to compute what each phase hands out."""
+    repeats = find(graph, [node for targets in phases for _, node in targets])
     computed: set[Node] = set()
-    parts = [list(_parts(graph, targets, computed)) for targets in phases]
-    return Schedule(parts, _place(graph, [part for phase in parts for part in phase]))
+    parts = [list(_parts(graph, repeats, targets, computed)) for targets in phases]
+    memory = _place(graph, repeats, [part for phase in parts for part in phase])
+    return Schedule(repeats, parts, memory)
 
 
 def is_free(graph: Graph, node: Node) -> bool:
@@ -63,12 +68,15 @@ def is_free(graph: Graph, node: Node) -> bool:
 
 
 def _parts(
-    graph: Graph, targets: Sequence[tuple[Target, Node]], computed: set[Node]
+    graph: Graph,
+    repeats: Repeats,
+    targets: Sequence[tuple[Target, Node]],
+    computed: set[Node],
 ) -> Iterator[Part]:
     """The parts of a phase; what has been `computed` grows."""
     part = Part([], [])
     for target, result in targets:
-        for node in _missing(graph, result, computed):
+        for node in _missing(graph, repeats, result, computed):
             part.nodes.append(node)
             computed.add(node)
             if len(part.nodes) >= LONGEST:
@@ -78,7 +86,7 @@ def _parts(
     yield part
 
 
-def _missing(graph: Graph, result: Node, computed: set[Node]) -> Iterator[Node]:
+def _missing(graph: Graph, repeats: Repeats, result: Node, computed: set[Node]) -> Iterator[Node]:
     """What has to be computed for a result, operands first."""
     waiting = [(result, False)]
     while waiting:
@@ -89,15 +97,15 @@ def _missing(graph: Graph, result: Node, computed: set[Node]) -> Iterator[Node]:
             yield node
             continue
         waiting.append((node, True))
-        waiting += [(operand, False) for operand in reversed(graph.operands[node])]
+        waiting += [(operand, False) for operand in reversed(repeats.operands(graph, node))]
 
 
-def _place(graph: Graph, parts: Sequence[Part]) -> Counter[str]:
+def _place(graph: Graph, repeats: Repeats, parts: Sequence[Part]) -> Counter[str]:
     """Gives what is read by later parts its place, and counts the places of each type."""
     home = {node: number for number, part in enumerate(parts) for node in part.nodes}
     last: dict[Node, int] = {}
     for number, part in enumerate(parts):
-        used = [operand for node in part.nodes for operand in graph.operands[node]]
+        used = [other for node in part.nodes for other in repeats.operands(graph, node)]
         for node in [*used, *(node for _, node in part.targets)]:
             if home.get(node, number) < number:
                 part.reads[node] = -1
