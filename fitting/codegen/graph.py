@@ -294,12 +294,12 @@ def _select(graph: Graph, chosen: Node, yes: Node, no: Node) -> Node | None:
         return graph.add("select", chosen, yes, inner[2])
     if (extreme := _extreme(graph, chosen, yes, no)) is not None:
         return extreme
-    if graph.operations[chosen] == "sign_bit" and yes == graph.add("negate", no):
+    if graph.operations[chosen] == "sign_bit" and graph.parts(yes, "negate") == (no,):
         if (parts := graph.parts(no, "abs")) is not None:
             return graph.add("copysign", parts[0], graph.operands[chosen][0])
-    given = _given(graph, yes, chosen, True, NESTED), _given(graph, no, chosen, False, NESTED)
-    if given != (yes, no):
-        return graph.add("select", chosen, *given)
+    bare = _unguarded(graph, yes, chosen, True), _unguarded(graph, no, chosen, False)
+    if bare != (yes, no):
+        return graph.add("select", chosen, *bare)
     if graph.is_constant(no, 0) and (parts := graph.parts(yes, "sqrt")) is not None:
         if graph.parts(chosen, "LT") == (no, *parts):  # of what is positive, else 0
             return graph.add("sqrt", graph.add("select", chosen, *parts, no))
@@ -329,7 +329,7 @@ def _extreme(graph: Graph, chosen: Node, yes: Node, no: Node) -> Node | None:
     return None
 
 
-def _given(graph: Graph, node: Node, chosen: Node, value: bool, depth: int) -> Node:
+def _unguarded(graph: Graph, node: Node, chosen: Node, value: bool, depth: int = NESTED) -> Node:
     """A node where a condition holds, or does not: what only guards it is left out.
 
     Functions guard their operands for the sake of derivatives, which nobody takes here.
@@ -341,7 +341,7 @@ def _given(graph: Graph, node: Node, chosen: Node, value: bool, depth: int) -> N
         return node
     if graph.operations[node] == "select" and operands[0] == chosen:
         return operands[1 if value else 2]
-    simpler = tuple(_given(graph, operand, chosen, value, depth - 1) for operand in operands)
+    simpler = tuple(_unguarded(graph, operand, chosen, value, depth - 1) for operand in operands)
     return node if simpler == operands else graph.add(graph.operations[node], *simpler)
 
 

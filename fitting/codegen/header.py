@@ -102,10 +102,10 @@ def _head(program: Program) -> list[str]:
     options = [name for name, on in parameter_tree.options(program.ik).items() if on]
     listed = ", ".join(f"{stage} {type(rule).__name__}" for stage, rule in rules.items())
     count = "1 leg" if program.legs == 1 else f"{program.legs} legs"
-    made_by = f"jaxik {metadata.version('jaxik')} with JAX {jax.__version__}"
+    versions = f"jaxik {metadata.version('jaxik')} with JAX {jax.__version__}"
     moving = ", and in platform the number of a moving one, or -1" if program.platforms else ""
     head = [
-        f"Foot IK of {count}, made by {made_by}. Do not edit.",
+        f"Foot IK of {count}, made by {versions}. Do not edit.",
         f"System: {listed}; with {', '.join(options) or 'no options'}.",
         f"Parameters: {digest(program.ik)}, the digest of their numbers.",
     ]

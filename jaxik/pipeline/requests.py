@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree, UInt
 from jaxik.batching.primitives import aval_of, function_of
 from jaxik.maths.struct import struct
 from jaxik.world.terrain import GivenHits, Hit, LegTerrains, Terrain
-from jaxik.world.terrain.given import BODY, request_p
+from jaxik.world.terrain.hits import BODY, request_p
 
 
 @struct
@@ -30,7 +30,7 @@ class Request:
 
 
 Answer: TypeAlias = Callable[[Request, int], Hit]
-"""What rays hit, by the number of the leg on whose ground they fall, or `given.BODY`."""
+"""What rays hit, by the number of the leg on whose ground they fall, or `hits.BODY`."""
 
 
 class OpenProgram:
@@ -95,7 +95,7 @@ def reading(hits: Hit) -> Answer:
         shape = request.length.shape
         rows = slice(start, start + math.prod(shape))
         start = rows.stop
-        return jax.tree.map(lambda leaf: leaf[rows].reshape(*shape, *leaf.shape[1:]), hits)
+        return jax.tree.map(lambda leaf: leaf[rows].reshape((*shape, *leaf.shape[1:])), hits)
 
     return answer
 

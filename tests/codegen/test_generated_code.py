@@ -34,10 +34,10 @@ C, CPP = ("-std=c99", *STRICT), ("-x", "c++", "-std=c++11", *STRICT)
 
 
 def compiler(language: str) -> str:
-    found = toolchain.compiler(language)
-    if found is None:
+    path = toolchain.compiler(language)
+    if path is None:
         pytest.skip(f"needs a compiler of {language}: none in $CC or $CXX, no cc or c++")
-    return found
+    return path
 
 
 class Recorded(NamedTuple):
@@ -51,11 +51,11 @@ class Recorded(NamedTuple):
 
 @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 def recorded(ik, rig, ground, frames) -> Recorded:
-    def one(state, frame):
+    def advance(state, frame):
         state, result, rays, hits = step_and_rays(ik, rig, ground, state, frame)
         return state, Recorded(state, result, rays, hits)
 
-    return jax.lax.scan(one, jaxik.init(ik, rig), frames)[1]
+    return jax.lax.scan(advance, jaxik.init(ik, rig), frames)[1]
 
 
 def largest_difference(ours: Any, theirs: Any) -> float:
@@ -96,11 +96,11 @@ def test_generated_c_gives_the_answers_of_jaxik_step(tmp_path, walk, hills, mec)
     rig, frames = walk
     ik, expected = mec
     frame = jax.tree.map(lambda leaf: leaf[0], frames)
-    made = export.export_c(ik, rig, tmp_path, terrain=hills, frame=frame)
-    assert [len(rays) for rays in made.rounds] == [4, 4, 10]
+    exported = export.export_c(ik, rig, tmp_path, terrain=hills, frame=frame)
+    assert [len(rays) for rays in exported.rounds] == [4, 4, 10]
     assert 0 < expected.hits.found.mean() <= 1
     for language, flags in {"c": C, "c++": CPP}.items():
-        compiled = Compiled(made, tmp_path, "footik", [compiler(language), "-O1", *flags])
+        compiled = Compiled(exported, tmp_path, "footik", [compiler(language), "-O1", *flags])
         play = Playback(compiled, (ik, rig), frames, expected.hits)
         play()
         states, rays, results = play.outputs()
@@ -208,7 +208,7 @@ def operated(n: Numbers) -> Outcomes:
     return Outcomes(exact, rounded)
 
 
-def made_of(function: Callable, row: Any, ik: jaxik.FootIK, rig: jaxik.Rig) -> program.Program:
+def program_of(function: Callable, row: Any, ik: jaxik.FootIK, rig: jaxik.Rig) -> program.Program:
     """A program whose result is that of a function of its frame."""
     graph, inputs = Graph(), []
     nodes = [program.input_nodes(graph, inputs, "frame", field) for field in program.fields_of(row)]
@@ -264,7 +264,9 @@ def differing(ours: Outcomes, theirs: Outcomes) -> dict[str, Any]:
 def operations(operands, walk) -> program.Program:
     with jax.enable_x64(False):
         row = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), operands[0])
-        return made_of(operated, row, workloads.single(jaxik.presets.ozz(faithful=True)), walk[0])
+        return program_of(
+            operated, row, workloads.single(jaxik.presets.ozz(faithful=True)), walk[0]
+        )
 
 
 def test_every_operation_gives_the_answers_of_jax(tmp_path, walk, operands, operations):

@@ -66,8 +66,8 @@ def recorded(ik: jaxik.FootIK, frames: jaxik.Frame) -> tuple[jaxik.Result, Hit, 
 
     def advance(states: tuple, frame: jaxik.Frame) -> tuple:
         state, result, _, hits = step_and_rays(ik, RIG, ground(), states[0], frame)
-        given = terrain.from_hits(hits, **ups)
-        replayed, again = jaxik.step(ik, RIG, given, states[1], frame)
+        replay = terrain.from_hits(hits, **ups)
+        replayed, again = jaxik.step(ik, RIG, replay, states[1], frame)
         return (state, replayed), (result, hits, again)
 
     state = jaxik.init(ik, RIG)
@@ -122,14 +122,15 @@ def test_hits_answer_casts_one_by_one_of_each_leg_and_in_batches():
     def function(ground: terrain.LegTerrains, x: jax.Array) -> list[Hit]:
         body = terrain.cast(ground.body, x[:, 0], 1.0)
         legs = terrain.cast(ground, x + body.point[:, None], jnp.array([3.0, 0.5]))
+        single = terrain.cast(ground, x[0], 3.0)
         rows = jax.vmap(lambda row: terrain.cast(ground, row[None], 2.0))(x)
-        return [body, legs, rows]
+        return [body, legs, rows, single]
 
     on_ground, by_hits, count = answered(function, ground, origins)
-    assert count == 5 + 10 + 10
+    assert count == 5 + 10 + 10 + 2
     assert_close(by_hits, on_ground, EXACT)
-    found = np.concatenate([hit.found.ravel() for hit in on_ground])
-    assert 0.2 < found.mean() < 0.9 and np.any(on_ground[1].platform == 0)
+    shares = np.concatenate([hit.found.ravel() for hit in on_ground])
+    assert 0.2 < shares.mean() < 0.9 and np.any(on_ground[1].platform == 0)
 
 
 def test_derivatives_take_the_ground_around_a_hit_as_its_plane():

@@ -5,7 +5,7 @@ drawing, and a grid over that drawing (`grid`) says which triangles a ray can hi
 hit is a discrete answer without a gradient. Where it is hit, and at what angle, follows from the
 plane of the triangle and is differentiable in the ray, up and the vertices.
 
-`building` makes terrains, `rays` casts rays onto them, `given` has ground whose hits a game gives.
+`building` makes terrains, `rays` casts rays onto them, `hits` has ground whose hits a game gives.
 """
 
 from .building import combine as combine
@@ -16,8 +16,8 @@ from .building import merge as merge
 from .building import mesh as mesh
 from .building import moving as moving
 from .building import plane as plane
-from .given import GivenHits as GivenHits
-from .given import from_hits as from_hits
+from .hits import GivenHits as GivenHits
+from .hits import from_hits as from_hits
 from .rays import ALL_LAYERS as ALL_LAYERS
 from .rays import HORIZON as HORIZON
 from .rays import Hit as Hit

@@ -1,0 +1,223 @@
+"""Exported systems over thousands of frames of all kinds, by several compilers."""
+
+# pyright: reportArgumentType=false
+
+import dataclasses
+import functools
+import shutil
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.bench import workloads
+from fitting.codegen import export
+from fitting.codegen.toolchain import Compiled, Outputs, Playback
+from fitting.runtime.precision import with_floats
+from jaxik.pipeline import step_and_rays
+from jaxik.world import terrain
+from jaxik.world.skeleton import Transform
+from jaxik.world.terrain import Hit
+from support.clips import make_rig, to_frames, to_rig, wandering
+
+CLOSE = 1e-5  # m, and of a quaternion
+STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
+BUILDS = {
+    "gcc": ("gcc", "-std=c99", "-O2", *STRICT),
+    "gcc, native": ("gcc", "-std=gnu99", "-O3", "-march=native", *STRICT),
+    "g++": ("g++", "-x", "c++", "-std=c++11", "-O2", *STRICT),
+    "clang": ("clang", "-std=c99", "-O2", *STRICT),
+    "clang, native": ("clang", "-std=c99", "-O3", "-march=native", *STRICT),
+}
+BUGS = (np.nan, np.inf, -np.inf, 1e-42, 3e38)
+ROUNDINGS = 8
+pytestmark = pytest.mark.slow
+
+
+class Case(NamedTuple):
+    """Frames of a system, and what JAX makes of them in 32 bits."""
+
+    ik: jaxik.FootIK
+    rig: jaxik.Rig
+    ground: terrain.Terrain | terrain.LegTerrains
+    frames: jaxik.Frame
+    starts: jaxik.State
+    states: jaxik.State
+    results: jaxik.Result
+    hits: Hit
+
+
+def frames_of(legs: int, count: int, bugs: int) -> jaxik.Frame:
+    """A wandering with restarts, partial weights, flight, and numbers that are none."""
+    rng = np.random.default_rng(legs)
+    frames = to_frames(wandering(make_rig(legs=min(legs, 2)), rng, count))
+    if legs > 2:
+        frames = workloads.with_legs(to_rig(make_rig()), frames, legs)[1]
+        away = rng.normal(0.0, 0.05, (legs, 3))
+        frames = dataclasses.replace(frames, pose=moved(frames.pose, away))
+    frames = jax.tree.map(np.array, frames)
+    leaves = [leaf for leaf in jax.tree.leaves(frames) if leaf.dtype.kind == "f" and leaf.size]
+    for bug in BUGS:
+        for _ in range(bugs):
+            leaf = leaves[rng.integers(len(leaves))].reshape(count, -1)
+            leaf[rng.integers(count), rng.integers(leaf.shape[1])] = bug
+    return dataclasses.replace(frames, restart=rng.uniform(size=count) < 0.01)
+
+
+def moved(pose: jaxik.LegPose, away: np.ndarray) -> jaxik.LegPose:
+    """Each leg somewhere else, m, so that no two are alike."""
+    joints = (pose.hip, pose.knee, pose.ankle, pose.toe)
+    return jaxik.LegPose(*(Transform(joint.pos + away, joint.rot) for joint in joints))
+
+
+def hills() -> terrain.Terrain:
+    mesh = workloads.mesh_field(100)
+    return terrain.mesh((mesh.vertices - [32.0, 0.0, 32.0]).astype(np.float32), mesh.faces)
+
+
+@jax.jit
+def recorded(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Any, frames: jaxik.Frame) -> tuple:
+    def advance(state: jaxik.State, frame: jaxik.Frame) -> tuple:
+        state, result, _, hits = step_and_rays(ik, rig, ground, state, frame)
+        return state, (state, result, hits)
+
+    return jax.lax.scan(advance, jaxik.init(ik, rig), frames)[1]
+
+
+def make_case(name: str, legs: int, count: int, bugs: int = 0, ground: Any = None) -> Case:
+    """A preset on hills, or on another ground."""
+    frames, rig = frames_of(legs, count, bugs), to_rig(make_rig(legs=min(legs, 2)))
+    if legs > 2:
+        rig = workloads.with_legs(rig, frames, legs)[0]
+    with jax.enable_x64(False):
+        frames, rig = single(frames), single(rig)
+        ground = hills() if ground is None else ground
+        ik = single(getattr(jaxik.presets, name)(rig))
+        states, results, hits = jax.device_get(recorded(ik, rig, ground, frames))
+        fresh = jax.device_get(jaxik.init(ik, rig))
+    starts = jax.tree.map(lambda a, b: np.concatenate([a[None], b[:-1]]), fresh, states)
+    return Case(ik, rig, ground, frames, starts, states, results, hits)
+
+
+def single(tree: Any) -> Any:
+    return with_floats(jax.tree.map(jnp.asarray, tree), jnp.float32)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, None, 0, 0, 0))
+def replayed(ik: Any, rig: Any, ground: Any, state: Any, frame: Any, hits: Hit) -> jaxik.Result:
+    ups = [leg.up_ws for leg in getattr(ground, "legs", ())] or None
+    replay = terrain.from_hits(hits, ground.up_ws, ups, ground.platform_count)
+    return jaxik.step(ik, rig, replay, state, frame)[1]
+
+
+def doubt(case: Case) -> np.ndarray:
+    """By how much JAX itself differs in each frame: in 64 bits, or where inputs are rounded."""
+    trees = (case.ik, case.rig, case.ground, case.starts, case.frames, case.hits)
+    with jax.enable_x64(True):
+        wide = with_floats(jax.tree.map(jnp.asarray, trees), jnp.float64)
+        others = [jax.device_get(replayed(*wide))]
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(False):
+        for _ in range(ROUNDINGS):
+            ik, rig, ground, *moving = single(trees)
+            rounded = jax.tree.map(lambda leaf: last_place(leaf, rng), moving)
+            others.append(jax.device_get(replayed(ik, rig, ground, *rounded)))
+    return np.max([differences(other, case.results) for other in others], axis=0)
+
+
+def last_place(leaf: Any, rng: np.random.Generator) -> np.ndarray:
+    """Floats with their last place changed, or not."""
+    numbers = np.asarray(leaf)
+    if numbers.dtype != np.float32:
+        return numbers
+    return numbers * (1 + np.float32(2.0**-23) * rng.integers(-1, 2, numbers.shape)).astype("f4")
+
+
+def differences(ours: Any, theirs: Any) -> np.ndarray:
+    """The largest of each frame; equal infinities and NaN do not differ."""
+    largest = []
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        a, b = (np.asarray(x, np.float64).reshape(len(x), -1) for x in (a, b))
+        with np.errstate(invalid="ignore"):
+            same = (a == b) | (np.isnan(a) & np.isnan(b))
+            gap = np.where(same, 0.0, np.abs(a - b))
+        largest.append(np.max(np.nan_to_num(gap, nan=np.inf), axis=1, initial=0.0))
+    return np.max(largest, axis=0)
+
+
+def played(case: Case, folder: Any, command: tuple[str, ...], *, chained: bool) -> Outputs:
+    frame = jax.tree.map(lambda leaf: leaf[0], case.frames)
+    program = export.export_c(case.ik, case.rig, folder, terrain=case.ground, frame=frame)
+    compiled = Compiled(program, folder, "footik", command)
+    starts = None if chained else case.starts
+    play = Playback(compiled, (case.ik, case.rig), case.frames, case.hits, starts)
+    play()
+    return play.outputs()
+
+
+def assert_agreement(case: Case, folder: Any, command: tuple[str, ...]) -> None:
+    """Each frame, and all in a row, but where JAX in 32 and in 64 bits differ as well."""
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"needs {command[0]}, which is not installed")
+    alone, chain = (played(case, folder, command, chained=chained) for chained in (False, True))
+    np.testing.assert_array_equal(alone.results.faulty, case.results.faulty)
+    off = np.flatnonzero(differences(alone.results, case.results) > CLOSE)
+    if len(off):
+        doubtful = doubt(case) > 0.5 * CLOSE
+        assert doubtful[off].all(), off[~doubtful[off]]
+        assert len(off) < 0.002 * len(case.frames.dt)
+    else:
+        assert differences(chain.results, case.results).max() < CLOSE
+        assert differences(chain.states, case.states).max() < 2 * CLOSE
+
+
+@pytest.mark.parametrize("name", ["record", "stride", "ozz", "mec", "unreal"])
+def test_ten_thousand_frames_of_a_preset_are_those_of_jax(name, tmp_path):
+    case = make_case(name, 2, 10_000, bugs=20)
+    assert 0.001 < np.mean(case.results.faulty) < 0.1
+    for command in BUILDS.values():
+        if shutil.which(command[0]):
+            assert_agreement(case, tmp_path, command)
+
+
+@pytest.mark.parametrize("legs", [1, 4, 8])
+@pytest.mark.parametrize("name", ["record", "stride", "mec"])
+def test_rigs_of_other_legs_are_those_of_jax(name, legs, tmp_path):
+    assert_agreement(make_case(name, legs, 500, bugs=2), tmp_path, BUILDS["gcc"])
+
+
+@pytest.mark.parametrize("name", ["record", "mec"])
+def test_platforms_and_ups_of_legs_are_those_of_jax(name, tmp_path):
+    still, moving = hills(), terrain.moving(terrain.plane((0.0, 0.05, 0.0), (0.1, 1.0, 0.0)), 0)
+    side = terrain.plane((0.6, 0.0, 0.0), up=(0.3, 1.0, -0.1))
+    ground = single(terrain.LegTerrains(still, (terrain.combine(still, moving), side)))
+    case = make_case_on_platform(name, ground)
+    assert {-1, 0} <= set(case.hits.platform.ravel().tolist())
+    assert_agreement(case, tmp_path, BUILDS["gcc"])
+
+
+def make_case_on_platform(name: str, ground: Any) -> Case:
+    """As `make_case`, with a platform that rises and turns."""
+    count, time = 500, np.arange(500) / 30.0
+    pos = np.stack([0.1 * time, 0.04 * np.sin(3.0 * time), 0.0 * time], -1)
+    rot = np.stack([np.cos(0.05 * time), 0.0 * time, np.sin(0.05 * time), 0.0 * time], -1)
+    tracks = Transform(jnp.asarray(pos)[:, None], jnp.asarray(rot)[:, None])
+    frames = frames_of(2, count, 1).with_platforms(tracks)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{__name__}.frames_of", lambda *_: jax.tree.map(np.asarray, frames))
+        return make_case(name, 2, count, 0, ground)
+
+
+@pytest.mark.parametrize("name", ["record", "stride", "mec"])
+def test_sanitizers_report_nothing_on_bad_frames(name, tmp_path):
+    case = make_case(name, 2, 300, bugs=60)
+    wild = ("gcc", "-std=c99", "-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
+    if shutil.which("gcc") is None:
+        pytest.skip("needs gcc, which is not installed")
+    assert np.mean(case.results.faulty) > 0.1
+    outputs = played(case, tmp_path, wild, chained=True)
+    np.testing.assert_array_equal(outputs.results.faulty, case.results.faulty)
