@@ -199,9 +199,9 @@ def _build(
         for field in fields_of(tree)
     ]
     hit_nodes, first = [], 0
-    for call in calls:
-        hit_nodes += _hit_inputs(graph, inputs, call, terrain.platform_count, first)
-        first += math.prod(call.length.shape)
+    for hit in hits:
+        hit_nodes += _hit_inputs(graph, inputs, hit, first)
+        first += hit.found.size
     outputs = stablehlo.read(exported(frame_of, trees), graph, [*nodes, *hit_nodes])
     requests, outputs = outputs[: 4 * len(calls)], outputs[4 * len(calls) :]
     after, result = outputs[: len(jax.tree.leaves(state))], outputs[len(jax.tree.leaves(state)) :]
@@ -259,23 +259,16 @@ def input_nodes(graph: Graph, inputs: list[Place], struct: str, field: Field) ->
     return nodes
 
 
-def _hit_inputs(
-    graph: Graph, inputs: list[Place], call: Request, platforms: int, first: int
-) -> list[np.ndarray]:
-    """The nodes of the hits of a call, whose first ray has this number."""
-    shape, nodes = call.length.shape, []
-    for name, kind, sizes in (
-        ("point", FLOAT, (3,)), ("normal", FLOAT, (3,)), ("distance", FLOAT, ()),
-        ("found", FLOAT, ()), ("platform", INT, ()),
-    ):  # fmt: skip
-        if name == "platform" and not platforms:
-            continue
-        field = Field((name,), kind, (math.prod(shape), *sizes))
+def _hit_inputs(graph: Graph, inputs: list[Place], hits: Hit, first: int) -> list[np.ndarray]:
+    """New inputs of a graph for the hits of a call, whose first ray has this number."""
+    rank, nodes = hits.found.ndim, []
+    for field in fields_of(hits):
         array = np.empty(field.shape, np.int64)
-        for index in np.ndindex(*array.shape):
-            array[index] = graph.input(kind, len(inputs))
-            inputs.append(Place("hits", field, (first + index[0], *index[1:])))
-        nodes.append(array.reshape(*shape, *sizes))
+        for number, index in enumerate(np.ndindex(*field.shape[:rank])):
+            for axis in np.ndindex(*field.shape[rank:]):
+                array[(*index, *axis)] = graph.input(field.kind, len(inputs))
+                inputs.append(Place("hits", field, (first + number, *axis)))
+        nodes.append(array)
     return nodes
 
 

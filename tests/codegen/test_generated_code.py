@@ -20,7 +20,7 @@ from fitting.clips.clip_frames import frames_from_clip
 from fitting.codegen import c_code, export, program, stablehlo, toolchain
 from fitting.codegen.graph import DTYPES, Graph
 from fitting.codegen.toolchain import Compiled, Playback
-from jaxik.maths import smoothing, vec
+from jaxik.maths import parameter_tree, smoothing, vec
 from jaxik.maths.gate import HARD
 from jaxik.maths.struct import struct
 from jaxik.pipeline import step_and_rays
@@ -85,30 +85,29 @@ def hills() -> terrain.Terrain:
 
 
 @pytest.fixture(scope="module")
-def mec(walk, hills) -> tuple[jaxik.FootIK, Recorded]:
-    """A system of three rounds with memory of places, and its motion on hills."""
-    ik = workloads.single(jaxik.presets.mec(walk[0]))
+def unreal(walk, hills) -> tuple[jaxik.FootIK, Recorded]:
+    """A small system of two rounds, which acts while the character walks, and its motion."""
+    ik = parameter_tree.replace(jaxik.presets.unreal(walk[0]), {"contact.idle_speed": 9.0})
+    ik = workloads.single(ik)
     with jax.enable_x64(False):
         return ik, jax.device_get(recorded(ik, walk[0], hills, walk[1]))
 
 
-def test_generated_c_gives_the_answers_of_jaxik_step(tmp_path, walk, hills, mec):
+def test_generated_c_gives_the_answers_of_jaxik_step(tmp_path, walk, hills, unreal):
     rig, frames = walk
-    ik, expected = mec
+    ik, expected = unreal
     frame = jax.tree.map(lambda leaf: leaf[0], frames)
     exported = export.export_c(ik, rig, tmp_path, terrain=hills, frame=frame)
-    assert [len(rays) for rays in exported.rounds] == [4, 4, 10]
+    assert [len(rays) for rays in exported.rounds] == [4, 12]
     assert 0 < expected.hits.found.mean() <= 1
-    for language, flags in {"c": C, "c++": CPP}.items():
-        compiled = Compiled(exported, tmp_path, "footik", [compiler(language), "-O1", *flags])
+    for language, flags in {"c": ("-O1", *C), "c++": ("-O0", *CPP)}.items():
+        compiled = Compiled(exported, tmp_path, "footik", [compiler(language), *flags])
         play = Playback(compiled, (ik, rig), frames, expected.hits)
         play()
         states, rays, results = play.outputs()
         assert largest_difference(results, expected.results) < CLOSE, language
         assert largest_difference(states, expected.states) < CLOSE, language
         assert largest_difference(rays, expected.rays) < CLOSE, language
-        decisions = [state.lock.locked for state in (states, expected.states)]
-        np.testing.assert_array_equal(*decisions)
 
 
 @struct

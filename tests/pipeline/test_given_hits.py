@@ -89,11 +89,18 @@ def test_hits_of_rays_replay_a_frame_as_it_is_on_the_terrain():
     ik, frame = jaxik.presets.unreal(faithful=True), at(clip(), 0)
     still = dataclasses.replace(frame, velocity_ws=jnp.zeros(3))
     slope = terrain.moving(terrain.plane((0.0, -0.05, 0.0), (0.2, 1.0, -0.3)), 0)
-    state, expected = jaxik.init(ik, RIG), jaxik.step(ik, RIG, slope, jaxik.init(ik, RIG), still)
-    *recorded, rays, hits = step_and_rays(ik, RIG, slope, state, still)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def three_ways(ik: jaxik.FootIK, frame: jaxik.Frame) -> tuple:
+        state = jaxik.init(ik, RIG)
+        after, result, rays, hits = step_and_rays(ik, RIG, slope, state, frame)
+        replay = terrain.from_hits(hits, platforms=1)
+        ways = [jaxik.step(ik, RIG, ground, state, frame) for ground in (slope, replay)]
+        return [*ways, (after, result)], rays, hits
+
+    (expected, *others), rays, hits = three_ways(ik, still)
     assert rays.origins_ws.shape == (6, 3) and np.all(hits.found == 1.0)
-    replayed = jaxik.step(ik, RIG, terrain.from_hits(hits, platforms=1), state, still)
-    for motion in (tuple(recorded), replayed):
+    for motion in others:
         assert_close(motion, expected, EXACT)
     corrections = expected[1].corrections.knee
     assert np.max(np.abs(corrections - quat.identity())) > 0.01, "the ground moves the legs"
@@ -126,7 +133,8 @@ def test_hits_answer_casts_one_by_one_of_each_leg_and_in_batches():
         rows = jax.vmap(lambda row: terrain.cast(ground, row[None], 2.0))(x)
         return [body, legs, rows, single]
 
-    on_ground, by_hits, count = answered(function, ground, origins)
+    quick = functools.partial(jax.jit, compiler_options=QUICK, static_argnums=0)
+    on_ground, by_hits, count = quick(answered)(function, ground, origins)
     assert count == 5 + 10 + 10 + 2
     assert_close(by_hits, on_ground, EXACT)
     shares = np.concatenate([hit.found.ravel() for hit in on_ground])
