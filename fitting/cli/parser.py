@@ -30,6 +30,7 @@ EXAMPLES = """examples:
   jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
   jaxik export runs/walk --as unreal -o walk.csv               in a game engine's names and units
+  jaxik export runs/walk --as c -o code                        the system itself, for an engine
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are cached
   jaxik parameters stride                                      what each one is and does

@@ -31,15 +31,16 @@ STRUCTS = {
     "result": "One frame after foot IK.",
 }
 USE = """\
-Use: for each character one state, made by @init; for each frame, in this order,
+Use: @init makes the state of a character. In each frame call, in this order,
 
 {calls}
 
-and in between cast the rays that have been added, from their origins along their directions, up to
-their lengths, onto the layers of their masks, and write what each hits at its place in hits: point
-and normal, and 1 in found, or 0 there where nothing is hit{platforms}. Rays, hits and work
-need not be kept from one frame to the next. Nothing is allocated, and there is no other memory, so
-that characters may be computed in parallel. Do not compile with -ffast-math.
+Each of these but the last adds rays behind those that are there. Cast them before the next call:
+from their origins along their directions, as far as their lengths, onto the layers of their masks.
+Of what rays[i] hits, write point and normal to hits[i], and 1 to its found, or 0 if it hits
+nothing{platforms}. Rays, hits and work need not be kept from one frame to the next. Nothing is
+allocated, and there is no other memory: characters may be computed in parallel. Do not compile
+with -ffast-math.
 
 Axes: x left, y up, z forward in model space; metres, seconds, radians; quaternions are w x y z. Of
 names, _ws is world space, _ms model space, and _ls the space of a joint; a_from_b takes points from
@@ -103,11 +104,13 @@ def _head(program: Program) -> list[str]:
     listed = ", ".join(f"{stage} {type(rule).__name__}" for stage, rule in rules.items())
     count = "1 leg" if program.legs == 1 else f"{program.legs} legs"
     versions = f"jaxik {metadata.version('jaxik')} with JAX {jax.__version__}"
-    moving = ", and in platform the number of a moving one, or -1" if program.platforms else ""
+    moving = ", and to its platform the number of what moves, or -1" if program.platforms else ""
+    ups = ", ".join(str(tuple(up.round(6).tolist())) for up in program.ups)
     head = [
         f"Foot IK of {count}, made by {versions}. Do not edit.",
         f"System: {listed}; with {', '.join(options) or 'no options'}.",
         f"Parameters: {digest(program.ik)}, the digest of their numbers.",
+        f"Up, of the body and of legs that have their own: {ups}.",
     ]
     if program.order != sorted(program.order):
         numbers = " ".join(map(str, program.order))

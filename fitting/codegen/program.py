@@ -68,6 +68,8 @@ class Program:
     ik: jaxik.FootIK
     legs: int
     platforms: int
+    ups: list[np.ndarray]
+    """Up of the body, then of each leg where these have their own."""
     trees: dict[str, PyTree]
     """Parameters, rig, state, frame and result, or their shapes."""
     graph: Graph
@@ -210,8 +212,9 @@ def _build(
     )
     count = len(jax.tree.leaves((ik, rig)))
     initial = stablehlo.read(exported(jaxik.init, (ik, rig)), graph, nodes[:count])
+    ups = [np.asarray(ground.up_ws) for ground in (terrain, *getattr(terrain, "legs", ()))]
     return Program(
-        ik, len(rig.side), terrain.platform_count, arguments | {"result": shapes[2]},
+        ik, len(rig.side), terrain.platform_count, ups, arguments | {"result": shapes[2]},
         graph, inputs, rounds, order,
         {"init": flat(initial), "state": flat(after), "result": flat(result)},
     )  # fmt: skip

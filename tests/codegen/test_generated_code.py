@@ -218,7 +218,7 @@ def program_of(function: Callable, row: Any, ik: jaxik.FootIK, rig: jaxik.Rig) -
     trees = {"parameters": ik, "rig": rig, "state": state, "frame": row}
     trees["result"] = jax.eval_shape(function, row)
     results = {"init": zeros, "state": zeros, "result": program.flat(outputs)}
-    return program.Program(ik, 2, 0, trees, graph, inputs, [], [], results)
+    return program.Program(ik, 2, 0, [], trees, graph, inputs, [], [], results)
 
 
 def rows_of_operands() -> Numbers:
