@@ -34,7 +34,7 @@ def _typed(dtype: type) -> Callable[[Number], Number]:
     return lambda x: dtype(x)
 
 
-def _whole(x: Number, low: float, high: float, dtype: type) -> Number:
+def _whole(x: Number, low: int, high: int, dtype: type) -> Number:
     """A float as a whole number, as XLA converts it: NaN to 0, others to the nearest there is."""
     return dtype(0 if np.isnan(x) else min(max(int(np.clip(x, low, high)), low), high))
 
@@ -144,7 +144,7 @@ class Graph:
             operands = operands[::-1]
         return self._node((name, *operands), name, operands, self._type(name, operands), None)
 
-    def is_constant(self, node: Node, number: float) -> bool:
+    def is_constant(self, node: Node, number: int) -> bool:
         """Whether a node is this number; zeros count as equal."""
         value = self.values[node]
         return value is not None and bool(value == number)

@@ -18,6 +18,7 @@ from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Rule
 
 from .c_code import C_TYPES, LETTERS, literal, signature
+from .graph import Number
 from .memory import words
 from .program import Field, Program
 from .schedule import Schedule
@@ -223,7 +224,7 @@ def _initialiser(fields: Sequence[Field], values: Iterator[np.ndarray], depth: i
     return f"{{\n{listed}\n{indent[4:]}}}"
 
 
-def _braced(values: np.ndarray) -> str:
+def _braced(values: np.ndarray | Number) -> str:
     if values.ndim:
         return "{" + ", ".join(map(_braced, values)) + "}"
     value = values[()]

@@ -175,9 +175,8 @@ def _build(
 ) -> Program:
     state = jaxik.init(ik, rig)
     opened = open_step(ik, Inputs(rig, terrain, frame, HARD), state)
-    calls = opened.requests
     arguments = {"parameters": ik, "rig": rig, "state": state, "frame": frame}
-    hits = [_hit_shapes(call, terrain.platform_count) for call in calls]
+    hits = [_blank_hits(shape, terrain.platform_count) for shape in opened.ray_shapes]
 
     def frame_of(
         ik: jaxik.FootIK, rig: jaxik.Rig, state: jaxik.State, frame: jaxik.Frame, hits: list[Hit]
@@ -205,7 +204,7 @@ def _build(
         hit_nodes += _hit_inputs(graph, inputs, hit, first)
         first += hit.found.size
     outputs = stablehlo.read(exported(frame_of, trees), graph, [*nodes, *hit_nodes])
-    requests, outputs = outputs[: 4 * len(calls)], outputs[4 * len(calls) :]
+    requests, outputs = outputs[: 4 * len(hits)], outputs[4 * len(hits) :]
     after, result = outputs[: len(jax.tree.leaves(state))], outputs[len(jax.tree.leaves(state)) :]
     rounds, order = _rounds(
         graph, inputs, [requests[i : i + 4] for i in range(0, len(requests), 4)]
@@ -247,9 +246,9 @@ def exported(function: Callable, trees: tuple) -> export.Exported:
     return export.export(jax.jit(function, keep_unused=True))(*trees)
 
 
-def _hit_shapes(call: Request, platforms: int) -> Hit:
-    numbers = jnp.zeros(call.length.shape, jnp.int32) if platforms else None
-    vectors, lengths = (jnp.zeros(x.shape, jnp.float32) for x in (call.origins_ws, call.length))
+def _blank_hits(shape: tuple[int, ...], platforms: int) -> Hit:
+    numbers = jnp.zeros(shape, jnp.int32) if platforms else None
+    vectors, lengths = jnp.zeros((*shape, 3), jnp.float32), jnp.zeros(shape, jnp.float32)
     return Hit(vectors, vectors, lengths, lengths, numbers)
 
 

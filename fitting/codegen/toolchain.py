@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxik
@@ -146,7 +147,8 @@ class Playback:
         states, words, results = self._outputs
         words = words.reshape(len(words), -1, RAY)
         floats = words.view(np.float32)
-        rays = Request(floats[..., :3], -floats[..., 3:6], floats[..., 6], words[..., 7])
+        parts = (floats[..., :3], -floats[..., 3:6], floats[..., 6], words[..., 7])
+        rays = Request(*map(jnp.asarray, parts))
         return Outputs(tree_of(states, trees["state"]), rays, tree_of(results, trees["result"]))
 
 

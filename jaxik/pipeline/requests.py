@@ -42,17 +42,15 @@ class OpenProgram:
         self._structure = jax.tree.structure(shapes)
 
     @property
-    def requests(self) -> list[Request]:
-        """Its requests in order: of each, the shapes of the rays."""
-        return [
-            Request(*(cast(Any, aval_of(atom)) for atom in request.invars))
-            for request in _requests(self._traced)
-        ]
+    def ray_shapes(self) -> list[tuple[int, ...]]:
+        """How many rays each of its requests has, in order, along each axis."""
+        lengths = (request.invars[2] for request in _requests(self._traced))
+        return [aval_of(length).shape for length in lengths]
 
     @property
     def ray_count(self) -> int:
         """How many rays it requests."""
-        return sum(math.prod(request.length.shape) for request in self.requests)
+        return sum(map(math.prod, self.ray_shapes))
 
     def checked(self, hits: Hit | None) -> Hit:
         """The hits, if they are of as many rays as it requests.
@@ -148,7 +146,7 @@ def _evaluate(traced: ClosedJaxpr | Jaxpr, values: list, answer: Answer) -> list
     for equation in jaxpr.eqns:
         operands = [read(atom) for atom in equation.invars]
         if equation.primitive is request_p:
-            hit = answer(Request(*operands), equation.params["ground"])
+            hit = answer(Request(*map(jnp.asarray, operands)), equation.params["ground"])
             results = [hit.point, hit.normal, hit.found, hit.platform][: len(equation.outvars)]
         elif equation.primitive.name == "jit" and _requests(equation.params["jaxpr"]):
             results = _evaluate(equation.params["jaxpr"], operands, answer)

@@ -273,7 +273,7 @@ def test_every_operation_gives_the_answers_of_jax(tmp_path, walk, operands, oper
     for file, text in export.texts(operations, "rules").items():
         (tmp_path / file).write_text(text)
     compiled = Compiled(operations, tmp_path, "rules", [compiler("c"), "-O0", *C])
-    hits = Hit(*(np.zeros((len(rows.x), 0, *size), np.float32) for size in ((3,), (3,), (), ())))
+    hits = Hit(*(jnp.zeros((len(rows.x), 0, *size), jnp.float32) for size in ((3,), (3,), (), ())))
     play = Playback(compiled, (operations.ik, walk[0]), rows, hits)
     play()
     assert differing(play.outputs().results, expected) == {}

@@ -157,7 +157,7 @@ def test_derivatives_take_the_ground_around_a_hit_as_its_plane():
 def test_hits_of_other_rays_and_hits_without_a_step_are_refused():
     state, none = jaxik.init(IK, RIG), Transform(jnp.zeros((0, 3)), jnp.zeros((0, 4)))
     frame = dataclasses.replace(at(clip(), 0), platforms=none, platforms_before=none)
-    zeros = {size: np.zeros((3, *size)) for size in ((), (3,))}
+    zeros = {size: jnp.zeros((3, *size)) for size in ((), (3,))}
     few = Hit(zeros[3,], zeros[3,], zeros[()], zeros[()])
 
     def refused(hits: Hit | None) -> str:
