@@ -5,6 +5,7 @@
 import dataclasses
 import functools
 import shutil
+import subprocess
 from typing import Any, NamedTuple
 
 import jax
@@ -169,7 +170,7 @@ def assert_agreement(case: Case, folder: Any, command: tuple[str, ...]) -> None:
     if len(off):
         doubtful = doubt(case) > 0.5 * CLOSE
         assert doubtful[off].all(), off[~doubtful[off]]
-        assert len(off) < 0.002 * len(case.frames.dt)
+        assert len(off) <= 1 + 0.001 * len(case.frames.dt)
     else:
         assert differences(chain.results, case.results).max() < CLOSE
         assert differences(chain.states, case.states).max() < 2 * CLOSE
@@ -214,10 +215,13 @@ def make_case_on_platform(name: str, ground: Any) -> Case:
 
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
 def test_sanitizers_report_nothing_on_bad_frames(name, tmp_path):
-    case = make_case(name, 2, 300, bugs=60)
-    wild = ("gcc", "-std=c99", "-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
     if shutil.which("gcc") is None:
         pytest.skip("needs gcc, which is not installed")
-    assert np.mean(case.results.faulty) > 0.1
-    outputs = played(case, tmp_path, wild, chained=True)
-    np.testing.assert_array_equal(outputs.results.faulty, case.results.faulty)
+    frames, rig = single(frames_of(2, 300, bugs=60)), single(to_rig(make_rig()))
+    ik, golden = getattr(jaxik.presets, name)(rig), export.GoldenTrace(hills(), frames)
+    export.export_c(ik, rig, tmp_path, golden=golden)
+    sanitizers = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    build = ["gcc", "-O1", *sanitizers, "footik.c", "check.c", "-lm", "-o", "check"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    done = subprocess.run(["./check"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr, done.stdout + done.stderr
