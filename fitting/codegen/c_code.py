@@ -218,24 +218,17 @@ def _entries(calls: Sequence[Sequence[tuple[str, list[str]]]]) -> Iterator[str]:
     """The functions that others call."""
     rounds = len(calls) - 2
     for phase, parts in enumerate(calls):
-        head = signature(phase, rounds)
-        stateful = phase in (0, rounds + 1)
-        names = re.findall(r"\*(\w+)[,)]", head)
+        head, changes_state = signature(phase, rounds), phase in (0, rounds + 1)
         used = {argument for _, arguments in parts for argument in arguments}
-        lines = [f"    (void){name};" for name in names if name not in used and name != "state"]
-        if "state" not in used and not stateful:
-            lines.append("    (void)state;")
-        lines += [
-            f"    {part}({', '.join(_passed(phase, arguments))});" for part, arguments in parts
-        ]
-        if stateful:
-            local = ["    @state after;"]
-            lines = [*local, *lines, "    *state = after;"]
+        used |= {"state"} if changes_state else set()
+        lines = ["    @state after;"] if changes_state else []
+        names = re.findall(r"\*(\w+)[,)]", head)
+        lines += [f"    (void){name};" for name in names if name not in used]
+        for part, arguments in parts:
+            passed = ("&after" if argument == "after" else argument for argument in arguments)
+            lines.append(f"    {part}({', '.join(passed)});")
+        lines += ["    *state = after;"] if changes_state else []
         yield "\n".join([f"{head} {{", *lines, "}"])
-
-
-def _passed(phase: int, arguments: Sequence[str]) -> list[str]:
-    return ["&after" if argument == "after" else argument for argument in arguments]
 
 
 class _Function:
