@@ -339,7 +339,7 @@ def test_exported_systems_have_their_time_their_size_and_their_targets(monkeypat
     )]  # fmt: skip
     assert (
         rows["unreal: machine code"].at_most == 300.0
-        and "rays of each round: 4, 12" in rows["unreal: a frame"].note
+        and "rays of each round: 12, 12" in rows["unreal: a frame"].note
     )
     monkeypatch.setattr(toolchain, "compiler", lambda: None)
     timings = measure("export")

@@ -99,7 +99,7 @@ def test_hits_of_rays_replay_a_frame_as_it_is_on_the_terrain():
         return [*ways, (after, result)], rays, hits
 
     (expected, *others), rays, hits = three_ways(ik, still)
-    assert rays.origins_ws.shape == (6, 3) and np.all(hits.found == 1.0)
+    assert rays.origins_ws.shape == (14, 3) and np.all(hits.found == 1.0)
     for motion in others:
         assert_close(motion, expected, EXACT)
     corrections = expected[1].corrections.knee
@@ -165,8 +165,8 @@ def test_hits_of_other_rays_and_hits_without_a_step_are_refused():
             jaxik.step(IK, RIG, terrain.from_hits(hits), state, frame)
         return str(error.value)
 
-    assert "the hits of 3 rays, and the system casts 18 in a frame" in refused(few)
-    assert "terrain has no hits, and the system casts 18 in a frame" in refused(None)
+    assert "the hits of 3 rays, and the system casts 26 in a frame" in refused(few)
+    assert "terrain has no hits, and the system casts 26 in a frame" in refused(None)
     for use in (
         lambda: terrain.cast(terrain.from_hits(few), jnp.zeros((4, 3)), 1.0),
         lambda: jaxik.run(IK, RIG, terrain.from_hits(few), jax.tree.map(lambda x: x[None], frame)),
