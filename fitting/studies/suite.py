@@ -417,11 +417,11 @@ LIMITATIONS = (
         "its original plants feet with which nobody steps; they go back once they are let go",
     ),
     Limitation(
-        "stride", f"{STAIRS}, {SLOPES}", "pelvis_jerk",
+        "stride", f"stairs up, leaning stairs up, {SLOPES}", "pelvis_jerk",
         "its pelvis sinks as fast as a trailing leg gets too long",
     ),
     Limitation(
-        "stride", "leaning stairs up, leaning stairs down", "pop",
+        "stride", "leaning stairs up", "pop",
         "its pelvis sinks as fast as a trailing leg gets too long",
     ),
 )  # fmt: skip

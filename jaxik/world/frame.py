@@ -140,6 +140,22 @@ class Rays:
 
 
 @struct
+class Landing:
+    """Where the swing of each foot ends."""
+
+    way_ws: Float[Array, "legs 3"]
+    """m, from the ground under the ankle to that below it at the next foothold."""
+    velocity_ws: Float[Array, "legs 3"]
+    """m/s, of the body, across the up of each leg."""
+    fraction: Float[Array, " legs"]
+    """0..1, time of the swing that has passed; 0 while standing."""
+    certain: Float[Array, " legs"]
+    """0..1, how sure it is that the foot lands there."""
+    root_height: Float[Array, ""] = place("height")
+    """Metres."""
+
+
+@struct
 class GroundHits:
     """The ground under each leg: what its rays hit."""
 
@@ -161,6 +177,8 @@ class GroundHits:
     """0..1, share of each sole that the ground of its foothold supports; None if not looked for."""
     until: Float[Array, " legs"] | None = None
     """s, until each foot lands; 0 while it stands. None if that is not known."""
+    landing: Landing | None = None
+    """None if not looked for."""
 
 
 @struct

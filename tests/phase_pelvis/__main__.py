@@ -24,7 +24,8 @@ from jaxik.maths import parameter_tree
 UP = np.array([0.0, 1.0, 0.0])
 LONGEST = 0.9999  # of its length, of a leg
 # As in `data/experiments/blocks_walk.toml`: the pelvis needs no smoothing on these blocks.
-EXACT = {"pelvis.rise_half_life": 0.0, "pelvis.fall_half_life": 0.0, "pelvis.spring": False}
+EXACT = {f"pelvis.{name}": 0.0 for name in ("landing_time", "rise_half_life", "fall_half_life")}
+EXACT |= {"pelvis.spring": False}
 SHIFTS, RATES = (0.0, 0.1, 0.15, 0.2, 0.3), (0.0, -0.15, -0.25, -0.4)
 
 

@@ -41,7 +41,7 @@ ODD: dict[str, Any] = (  # away from the defaults
 REACH = (
     {"contact.ground_height": 0.01}
     | named("pelvis", highest_share=0.5, extension=0.93, softness=0.04, shift=0.3)
-    | named("pelvis", rise_half_life=0.04, fall_half_life=0.07)
+    | named("pelvis", rise_half_life=0.04, fall_half_life=0.07, landing_time=0.2)
 )
 SUPPORT = (
     named("contact", ground_height=0.01, planted_height=0.071, raised_height=0.09)

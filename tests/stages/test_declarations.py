@@ -61,7 +61,7 @@ LegLengthPelvis: min_length m 0.5 0 1; max_length m 0.88 0.2 1.5; speed 1/s 10 0
 LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95;
   min_extension 1 0 0 0.8
 ReachPelvis: highest_share 1 0.75 0 1.2; extension 1 0.958 0.85 1; softness m 0.025 0.002 0.1;
-  shift 1 0.15 0 1
+  shift 1 0.15 0 1; landing_time s 0 0.02 0.3
 ReachPelvis SlopeTarget: rise_half_life s 0 0.002 0.5; fall_half_life s 0 0.002 0.5
 SupportPelvis: lowest_share 1 0.3 0 1; rise_half_life s 0.1 0.002 0.5;
   fall_half_life s 0.1 0.002 0.5
@@ -131,7 +131,7 @@ mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no
 stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
-  ReachPelvis rise_half_life=0.08 fall_half_life=0.03 spring=yes; HeelEffector;
+  ReachPelvis landing_time=0.12 rise_half_life=0.1 fall_half_life=0.04 spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
   PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 """

@@ -183,6 +183,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.extension", (0.92, 0.95), "+ pelvis height", TILTED),
         Case("pelvis.shift", (0.1, 0.3), "- pelvis forward", STEP_UP, clip="walks"),
         Case("pelvis.softness", (0.01, 0.05), "+ pelvis height", TILTED),
+        Case("pelvis.landing_time", (0.1, 0.2), "- pelvis height", RAMP_DOWN, clip="walks"),
         LIFTS("effector.by_contact", (False, True), "+ miss", TILTED),
         Case("effector.extension", (0.92, 0.95), "+ pitch", STEEP),
         Case("effector.max_lift", (0.05, 0.15), "- pitch", STEEP, {"effector.extension": 0.92}),

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import vec
 from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.maths.parameter_tree import Rule
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.stages.lean import Lean
 from jaxik.world.frame import Sensed
@@ -18,6 +18,16 @@ from jaxik.world.skeleton import Rig, Transform
 
 HEIGHT_BAND = 0.01  # m
 FAR = 1e6  # m, beyond any leg
+
+
+@struct
+class Approach:
+    """What tells, a frame later, how fast swings end and the root rises."""
+
+    fraction: Float[Array, " legs"]
+    """0..1, time of each swing that has passed."""
+    root_height: Float[Array, ""] = place("height")
+    """Metres."""
 
 
 @struct
@@ -36,6 +46,8 @@ class PelvisState:
     """m, of the capsule; 0 where a rule has none."""
     ahead: Float[Array, ""]
     """m, along the character's heading; 0 where a rule does not shift the body."""
+    approach: Approach | None = None
+    """None where a rule does not look at where feet land."""
 
     @classmethod
     def level(cls, rig: Rig) -> "PelvisState":

@@ -2,6 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,14 +10,15 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import HARD
-from jaxik.maths.parameter_tree import Leaf, half_life, length, ratio, switch
+from jaxik.maths.parameter_tree import Leaf, duration, half_life, length, ratio, switch
 from jaxik.maths.struct import struct
-from jaxik.world.skeleton import Transform, mean_position
+from jaxik.world.skeleton import Rig, Transform, mean_position
 
 from .base import (
     FAR,
     HEIGHT_BAND,
     AbstractPelvis,
+    Approach,
     PelvisMoment,
     PelvisState,
     greatest_load,
@@ -27,6 +29,9 @@ from .base import (
     rise_to_length,
     supported_heights,
 )
+
+EARLIEST = 10.0  # landing times before a landing; its share is then less than numbers resolve
+FASTEST = 2.0  # m/s, of a root that climbs; one that is faster has jumped
 
 
 @struct
@@ -51,14 +56,16 @@ class AbstractFollowingPelvis(AbstractPelvis):
     spring: eqx.AbstractVar[Array]
 
     @abstractmethod
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
+    def goal(
+        self, now: PelvisMoment, target: Transform, state: PelvisState, resting: Array
+    ) -> Goal:
         """Where to go; to the height `resting`, m, if no foot requests one."""
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         resting = jnp.where(now.started, state.goal, mean_height(sensed, requested))
-        goal = self.goal(now, target, resting)
+        goal = self.goal(now, target, state, resting)
         gap = goal.height - state.height
         rising, falling = (
             smoothing.fraction_of_half_life(half_life, now.dt)
@@ -96,7 +103,9 @@ class SupportPelvis(AbstractFollowingPelvis):
     fall_half_life: Leaf = half_life(0.1, "Time in which the pelvis covers half its way down.")
     spring: Leaf = switch(False, "Whether the pelvis moves as a critically damped spring.")
 
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
+    def goal(
+        self, now: PelvisMoment, target: Transform, state: PelvisState, resting: Array
+    ) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.load
@@ -117,6 +126,11 @@ class ReachPelvis(AbstractFollowingPelvis):
     soft minimum of the animation is subtracted, so that nothing moves on ground like that of the
     animation, however straight its legs are. On captured people on uneven blocks, reach explains
     most of the pelvis height.
+
+    A foot that will land lower needs the body lower as soon as it does. So within about
+    `landing_time` a swinging leg's limit passes to that at its next foothold, where the body will
+    be then: the limit there, higher by `k (t / landing_time)^2`, `t` before. The time that is left
+    follows from how much of the swing passes in a frame, so footholds have to be known.
 
     The body also moves forward or back towards the foot whose leg limits it, the lower of two: by
     `shift` of how much further ahead of its hip that foot is than in the animation. People stay
@@ -145,11 +159,31 @@ class ReachPelvis(AbstractFollowingPelvis):
         1,
         "Part of the way to the foot whose leg limits it that the pelvis moves ahead or back.",
     )
+    landing_time: Leaf = duration(
+        0,
+        0.02,
+        0.3,
+        "How long before a foot lands its leg's length there limits the pelvis; 0 is not before.",
+        scale="log",
+        follows="time",
+    )
     rise_half_life: Leaf = half_life(0, "Time in which the pelvis covers half its way up.")
     fall_half_life: Leaf = half_life(0, "Time in which the pelvis covers half its way down.")
     spring: Leaf = switch(False, "Whether the pelvis moves as a critically damped spring.")
 
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
+    def init(self, rig: Rig) -> PelvisState:
+        zero = jnp.zeros_like(rig.side)
+        return dataclasses.replace(super().init(rig), approach=Approach(zero, zero[0]))
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        landing, approach = now.sensed.ground.landing, state.approach
+        if landing is not None:
+            approach = Approach(landing.fraction, landing.root_height)
+        return dataclasses.replace(super().advance(now, target, state), approach=approach)
+
+    def goal(
+        self, now: PelvisMoment, target: Transform, state: PelvisState, resting: Array
+    ) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         load, mean = greatest_load(sensed), mean_height(sensed, requested)
@@ -166,24 +200,81 @@ class ReachPelvis(AbstractFollowingPelvis):
             reach = shares * vec.dot(ankle_ws - hip_ws, forward_ws)
             return load * vec.safe_divide(vec.sum_last(reach), vec.sum_last(shares))
 
-        def reachable_height(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
-            heights = rise_to_length(sensed, hip_ws, ankle_ws, longest)
-            limits = vec.stack(*vec.unstack(limits_of(sensed, heights, wanted)), wanted)
-            weights = vec.stack(*vec.unstack(sensed.load), jnp.ones_like(wanted))
-            lowest, shares = self._lowest(limits, weights)
+        ends = _ends_of_swings(now, state.approach, self.landing_time)
+        weights = vec.stack(
+            *vec.unstack(sensed.load * (1.0 - ends.share)),
+            *vec.unstack(sensed.load * ends.certain),
+            jnp.ones_like(load),
+        )
+
+        def limits(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
+            return limits_of(sensed, rise_to_length(sensed, hip_ws, ankle_ws, longest), wanted)
+
+        def reachable_height(
+            hip_ws: Array, ankle_ws: Array, landing_ws: Array, wanted: Array
+        ) -> Array:
+            later = limits(hip_ws, landing_ws, wanted) + self.softness * ends.lateness
+            heights = limits(hip_ws, ankle_ws, wanted)
+            heights = vec.stack(*vec.unstack(heights), *vec.unstack(later), wanted)
+            lowest, shares = self._lowest(heights, weights)
             return lowest - self.softness * jnp.log(vec.sum_last(shares))
 
         animated_ws = sensed.unscaled_ankle_ws
         ahead = limiting_ahead(hip_ws, target.pos) - limiting_ahead(sensed.hip_ws, animated_ws)
         ahead *= self.shift
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
-        animated = reachable_height(sensed.hip_ws, animated_ws, jnp.zeros_like(wanted))
-        return Goal(reachable_height(shifted_ws, target.pos, wanted) - animated, ahead)
+        level_ws = animated_ws + ends.way_ws
+        landing_ws = target.pos + ends.way_ws + vec.scale(sensed.leg_up_ws, ends.rise)
+        animated = reachable_height(sensed.hip_ws, animated_ws, level_ws, jnp.zeros_like(wanted))
+        moved = reachable_height(shifted_ws, target.pos, landing_ws, wanted)
+        return Goal(moved - animated, ahead)
 
     def _lowest(self, limits: Array, weights: Array) -> tuple[Array, Array]:
         """The lowest of limits, m, and how far each of them, of these weights, is the lowest."""
         lowest = HARD.minimum(limits, band=0.0)
         return lowest, weights * jnp.exp((lowest - limits) / self.softness)
+
+
+class EndsOfSwings(NamedTuple):
+    """How swings end, as seen from the body as it will then be."""
+
+    share: Float[Array, " legs"]
+    """0..1, how far a leg is where it lands already."""
+    certain: Float[Array, " legs"]
+    """0..1, how far the limits there count at all."""
+    lateness: Float[Array, " legs"]
+    """How many softnesses higher they are as long as the foot swings."""
+    way_ws: Float[Array, "legs 3"]
+    """m, how far ankles have to go, across the up of each leg."""
+    rise: Float[Array, " legs"]
+    """m, how far they have to rise."""
+
+
+def _ends_of_swings(
+    now: PelvisMoment, before: Approach | None, landing_time: Array
+) -> EndsOfSwings:
+    """Where feet land; the time until then follows from how much of a swing passes in a frame."""
+    sensed = now.sensed
+    landing, none = sensed.ground.landing, jnp.zeros_like(sensed.load)
+    if landing is None or before is None:
+        return EndsOfSwings(none, none, none + FAR, jnp.zeros_like(sensed.hip_ws), none)
+    step, rest = landing.fraction - before.fraction, 1.0 - landing.fraction
+    near = now.started & (step > 0) & (landing.certain > 0)
+    near &= rest * now.dt < EARLIEST * landing_time * step
+    remaining = jnp.where(near, rest / jnp.where(near, step, 1.0), 0.0)
+    time = remaining * now.dt
+    lateness = (time / jnp.where(landing_time > 0, landing_time, 1.0)) ** 2
+    climbed = landing.root_height - before.root_height - sensed.ground_rise
+    highest = FASTEST * now.dt
+    climbed = jnp.where(jnp.abs(climbed) < highest, climbed, jnp.sign(climbed) * highest)
+    lift = 0.0 if sensed.ground.lift is None else sensed.ground.lift
+    return EndsOfSwings(
+        share=jnp.where(near, landing.certain * jnp.exp(-lateness), 0.0),
+        certain=jnp.where(near, landing.certain, 0.0),
+        lateness=jnp.where(near, lateness, FAR),
+        way_ws=vec.reject(landing.way_ws, sensed.leg_up_ws) - vec.scale(landing.velocity_ws, time),
+        rise=vec.dot(landing.way_ws, sensed.leg_up_ws) - lift - climbed * remaining,
+    )
 
 
 def _tilted_hips(now: PelvisMoment) -> Float[Array, "legs 3"]:

@@ -13,7 +13,7 @@ from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, duration, option, ratio, switch, threshold
 from jaxik.maths.smoothing import Deviation, clip_to_one, lerp, settle, smoothstep
 from jaxik.stages.inputs import GroundMoment, Inputs
-from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
+from jaxik.world.frame import Contact, GroundHits, Landing, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
@@ -308,7 +308,17 @@ class StrideProbe(AbstractSupportedProbe):
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         turns = jnp.ones_like(found)
         lift, pitch = found * swing.lift, found * swing.pitch
-        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch)
+        end_rise = lerp(plane_rise, least_rise(plane_rise, heel_rises[-1]), heels.found[-1])
+        landing = Landing(
+            way_ws=vec.reject(stride.next_ws - ball, level.up_ws)
+            + vec.scale(level.up_ws, high + end_rise - height),
+            velocity_ws=vec.reject(jnp.broadcast_to(frame.velocity_ws, ball.shape), level.up_ws),
+            fraction=stride.fraction,
+            certain=stride.known * trust,
+            root_height=vec.dot(frame.world_from_model.pos, inputs.terrain.up_ws),
+        )
+        nothing = no_hit(hit)
+        return GroundHits(hit, nothing, nothing, turns, rays, lift, pitch, landing=landing)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""

@@ -66,6 +66,15 @@ class Slide(NamedTuple):
     support: float
 
 
+class Landing(NamedTuple):
+    """Where a swing ends: how far away, level and up, m, and how sure that is, 0..1."""
+
+    way: Array
+    rise: float
+    fraction: float
+    certain: float
+
+
 @dataclass
 class UnderBall:
     """The ground under the ball of a leg, as its stride leads from one foothold to the other."""
@@ -76,6 +85,7 @@ class UnderBall:
     normal: Array = field(default_factory=lambda: np.zeros(3))
     heel_rise: float = 0.0
     heel_found: float = 0.0
+    end_height: float = 0.0
     step: float = 0.0
     over: float = 0.0
     edge: float = 0.0
@@ -266,7 +276,10 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
             heel_found += part
     if heel_found > 0.0:
         heel_rise /= heel_found
-    under = ground, normal, heel_rise, heel_found
+    plane = climb(leg, normal, arm)
+    heel = look(leg, level(leg, stride.next + arm))
+    end = high + (shared_rise(plane, height(leg, heel.point) - high) if heel.found else plane)
+    under = ground, normal, heel_rise, heel_found, end
     return UnderBall(stride, found, *under, step, over, edge, sure * arrives, platform)
 
 
@@ -322,6 +335,15 @@ def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swin
     stride = replace(stride, lift=lift * ball.found, pitch=pitch * ball.found)
     normal = unit(leg.up + ball.found * (under - leg.up), leg.up)
     return Hit(ball.found, point, normal, ball.platform), stride
+
+
+def landing(leg: Leg, ball: UnderBall, hit: Hit) -> Landing:
+    """Where the swing of a leg over the ground that was hit below its ankle ends."""
+    stride = ball.stride
+    way = stride.next - level(leg, leg.pos_ws("toe"))
+    rise = ball.end_height - height(leg, hit.point)
+    certain = ball.sure * stride.known
+    return Landing(across(way, leg.up), rise, stride.fraction, certain)
 
 
 def climbable(leg: Leg, heights: Sequence[float | None], slope: float) -> float:

@@ -3,7 +3,7 @@
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,13 @@ from reference.stages import ground, limb, spine, stride_probe
 from reference.stages.ground import Followed, Foot, Hold, Standing
 from reference.terrain import ALL_LAYERS
 
+FASTEST = 2.0  # m/s, of a root that climbs
+
 # The alternatives in the stages that have two rules.
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
     "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.025, shift=0.15)
-    | named("pelvis", rise_half_life=0.08, fall_half_life=0.03, spring=True),
+    | named("pelvis", rise_half_life=0.1, fall_half_life=0.04, spring=True, landing_time=0.12),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
 }
@@ -57,6 +59,8 @@ class State:
     pelvis_goal: float
     ahead: float
     pelvis_offset_ws: Array
+    fractions: list[float]
+    root_height: float
 
 
 def step(
@@ -80,6 +84,7 @@ def step(
         supports.append(slide.support)
 
     feet, swings, followed, holds, footholds, targets, turns = [], [], [], [], [], [], []
+    landings = []
     offset_before = state.pelvis_offset_ws if state else np.zeros(3)
     for leg, slid, stands, ball in zip(legs, probed, standing, balls, strict=True):
         below = stride_probe.below_others(slid, probed, balls)
@@ -92,6 +97,7 @@ def step(
         pitch = maths.from_axis_angle(stride_probe.axis_of_pitch(leg), swing.pitch)
         feet.append(foot)
         swings.append(swing)
+        landings.append(stride_probe.landing(slid, ball, hit))
         followed.append(memory)
         holds.append(hold)
         footholds.append(foothold)
@@ -108,7 +114,13 @@ def step(
         hips = np.array([foot.pos_ws("hip") for foot in feet])
         middle = np.mean(hips, axis=0)  # about which the pelvis has tilted
         hips = [middle + maths.rotate(tilt_ws, hip - middle) for hip in hips]
-        goal, ahead = reach_goal(parameters, feet, targets, requested, terrain.up, forward, hips)
+        ends = [
+            end_of_swing(foot, landing, foothold, terrain.up, state)
+            for foot, landing, foothold in zip(feet, landings, footholds, strict=True)
+        ]
+        goal, ahead = reach_goal(
+            parameters, feet, targets, requested, terrain.up, forward, hips, ends
+        )
     else:
         goal, ahead = support_goal(parameters, feet, requested, state), 0.0
     eased = ground.ease(parameters, "pelvis", state.pelvis if state else None, goal, frame.dt)
@@ -151,7 +163,10 @@ def step(
         "target_ws": np.array(aims),
         "stretch": np.array(stretches),  # by how much the target is farther than animated
     }
-    return State(standing, followed, holds, leaning, eased, goal, ahead, offset_ws), output
+    fractions = [landing.fraction for landing in landings]
+    root_height = float(frame.world_from_model.pos @ terrain.up)
+    pelvis = eased, goal, ahead, offset_ws, fractions, root_height
+    return State(standing, followed, holds, leaning, *pelvis), output
 
 
 run = functools.partial(characters.run, step)
@@ -207,6 +222,56 @@ def support_goal(
     return lerp(resting, goal, min(sum(weights), 1.0))
 
 
+class EndOfSwing(NamedTuple):
+    """How a swing ends, as seen from the body then.
+
+    `share`, 0..1, is how far its leg is there already, `certain`, 0..1, how far that counts, and
+    `lateness` by how many softnesses the limit there is higher yet. `way` and `rise`, m, lead there
+    from where the foot is.
+    """
+
+    share: float
+    certain: float
+    lateness: float
+    way: Array
+    rise: float
+
+
+def end_of_swing(
+    foot: Foot,
+    landing: stride_probe.Landing,
+    foothold: Array,
+    up: Array,
+    state: State | None,
+) -> EndOfSwing:
+    """The end of the swing of a foot whose foothold is there now (3)."""
+    step = landing.fraction - state.fractions[foot.index] if state else 0.0
+    if state is None or step <= 0.0 or foot["pelvis.landing_time"] == 0.0:
+        return EndOfSwing(0.0, 0.0, 0.0, np.zeros(3), 0.0)
+    frame = foot.frame
+    time = frame.dt * (1.0 - landing.fraction) / step
+    carried_rise = float((foothold - previous_place(frame, foot.hit, foothold)) @ foot.up)
+    root_height = float(frame.world_from_model.pos @ up)
+    speed = (root_height - state.root_height - carried_rise) / frame.dt
+    climbed = maths.clip(speed, -FASTEST, FASTEST) * time
+    lateness = (time / foot["pelvis.landing_time"]) ** 2
+    return EndOfSwing(
+        landing.certain * math.exp(-lateness),
+        landing.certain,
+        lateness,
+        landing.way - maths.across(frame.travel_ws, foot.up) * time,
+        landing.rise - foot.swing_lift - climbed,
+    )
+
+
+def previous_place(frame: Frame, hit: characters.Hit, point: Array) -> Array:
+    """Where a point of the ground that was hit was in the previous frame."""
+    if hit.platform < 0:
+        return point
+    before, now = frame.platforms_before[hit.platform], frame.platforms[hit.platform]
+    return maths.apply(before, maths.unapply(now, point))
+
+
 def reach_goal(
     parameters: Parameters,
     feet: list[Foot],
@@ -215,6 +280,7 @@ def reach_goal(
     up: Array,
     forward: Array,
     hips: list[Array],
+    ends: list[EndOfSwing],
 ) -> tuple[float, float]:
     """Between the mean and the highest of the requested heights, within reach of all legs.
 
@@ -251,11 +317,22 @@ def reach_goal(
         shares = loads * np.exp((heights.min() - heights) / softness)
         return float(loads.max() * (shares @ np.array(to_feet) @ forward) / shares.sum())
 
-    def reachable(heights: Array, free: float) -> float:
+    shares, certain, lateness = (
+        np.array([getattr(end, name) for end in ends]) for name in ("share", "certain", "lateness")
+    )
+
+    def reachable(heights: Array, landed: Array, free: float) -> float:
         """A smooth lower bound of the height wanted and what the legs reach, m."""
-        parts = loads @ np.exp((free - eased(heights, free)) / softness)
+        parts = (loads * (1.0 - shares)) @ np.exp((free - eased(heights, free)) / softness)
+        parts += (loads * certain) @ np.exp((free - eased(landed, free)) / softness - lateness)
         return free - softness * math.log(1.0 + parts)
 
     ahead = parameters["pelvis.shift"] * (limiting_ahead(moved) - limiting_ahead(animated))
-    shifted = highest_hips([way - ahead * forward for way in moved])
-    return reachable(shifted, wanted) - reachable(highest_hips(animated), 0.0), ahead
+    shifted = [way - ahead * forward for way in moved]
+    landed = [
+        way + end.way + end.rise * foot.up
+        for way, end, foot in zip(shifted, ends, feet, strict=True)
+    ]
+    level = [way + end.way for way, end in zip(animated, ends, strict=True)]
+    height = reachable(highest_hips(shifted), highest_hips(landed), wanted)
+    return height - reachable(highest_hips(animated), highest_hips(level), 0.0), ahead
