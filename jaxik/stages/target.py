@@ -116,7 +116,7 @@ class SlopeTarget(AbstractTarget):
         False, "Whether footholds keep up with a slope on which they move, without delay."
     )
     max_acceleration: Leaf = constant(
-        40.0, "Acceleration of a foothold's height from which its changes are jumps.", unit="m/s^2"
+        40.0, "Acceleration of a foothold's height from which its changes are jumps.", unit="m/s²"
     )
     max_penetration: Leaf = length(
         inf,

@@ -212,6 +212,7 @@ SOLES = ("probe.clearance", "probe.heel_length", "probe.toe_length")  # likewise
 SWITCHES = ("pelvis.enabled", "effector.by_contact", "effector.if_found")  # of `ozz`, too
 CONSTANTS = ("probe.uneven_height", "probe.highest_step")
 OPTIONAL = ("warp.", "leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
+OPTIONAL += ("target.max_acceleration",)
 IN_OWN_TESTS = {
     "record": (*OPTIONAL, "probe.max_", "probe.step_fade", "probe.layers", *WIDTHS, *SWITCHES),
     "stride": (*OPTIONAL, "lean.", "separation.", *WIDTHS, OVER, *SOLES, *CONSTANTS),
