@@ -259,7 +259,7 @@ def directions(frames: int = 40) -> tuple[np.ndarray, ...]:
     """Directions all round, in the air at times, with legs of all weights and bearings."""
     rng = np.random.default_rng(2)
     grounded = (np.arange(frames) % 9 > 0).astype(float)
-    weight = rng.uniform(0.0, 0.1, (frames, 3)) * (np.arange(frames) % 3 > 0)[:, None]
+    weight = rng.uniform(0.0, 1.0, (frames, 3)) * (np.arange(frames) % 3 > 0)[:, None]
     points = rng.normal(0.0, 0.5, (frames, 3, 3))
     return np.linspace(-7.0, 7.0, frames), grounded, weight, points, rng.uniform(size=(frames, 3))
 
@@ -271,7 +271,7 @@ def test_feet_and_pelvis_are_turned_as_in_numpy():
     for orientation, grounded, weight, points, bearing in zip(*directions(), strict=True):
         sine, cosine = np.sin(orientation), np.cos(orientation)
         aside = np.arctan2(sine, abs(cosine))  # from the line of motion, whichever way along it
-        aside = np.clip(aside, -1.2, 1.2) * grounded * min(1.0, weight[:2].sum() / 0.1)
+        aside = np.clip(aside, -1.2, 1.2) * grounded * min(1.0, weight[:2].sum())
         memory = aside if memory is None else memory + (aside - memory) * (1.0 - 2.0 ** (-DT / 0.2))
         pelvis = Rotation.from_rotvec([0.0, 0.3 * memory, 0.0])
         rest = Rotation.from_rotvec(np.outer(0.7 * memory * bearing, [0.0, 1.0, 0.0]))
