@@ -152,10 +152,12 @@ class Clip(AbstractFrames):
 
         if not jax.tree.leaves(memory):
 
-            def instant(dt: Array, sensed: PyTree, at: Tracks) -> PyTree:
-                return advance(Moment(dt, state.started, gate), sensed, memory, at).output
+            def instant(dt: Array, sensed: PyTree, at: Tracks, *whereabouts: Any) -> PyTree:
+                now = GroundMoment(dt, state.started, gate, self.inputs.ground(*whereabouts))
+                return advance(now, sensed, memory, at).output
 
-            return Ahead(memory, jax.vmap(instant)(frames.dt, sensed, self.tracks))
+            whereabouts = frames.platforms, self._centres
+            return Ahead(memory, jax.vmap(instant)(frames.dt, sensed, self.tracks, *whereabouts))
 
         if not jax.tree.leaves(sensed):  # a frame without what the stage goes by costs nothing
             count = len(frames.dt)
