@@ -144,8 +144,9 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             above *= vec.safe_divide(at(line.found, point), sole)
             block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
             hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
-            share += at(line.found, point) * (1.0 - block - hollow) / len(SOLE)
-            blocked += block / len(SOLE)
+            share += at(line.found, point) * (1.0 - block - hollow)
+            blocked += block
+        share, blocked = share / len(SOLE), blocked / len(SOLE)
         slide = jnp.asarray(tenths, tenth.dtype) * tenth + jnp.zeros_like(share)
         lack = self.min_sole - at(firm) * (share - BLOCKS * blocked)
         detour = jnp.asarray(SLIDE_COST * 0.1 * np.abs(tenths - AHEAD), tenth.dtype)
