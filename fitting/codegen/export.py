@@ -78,7 +78,7 @@ def export_c(
 
     Raises:
         ValueError: the system has an operation without a rule, such as a loop, its arrays do not
-            fit the legs, the name is none for C, or a file cannot be written.
+            fit the legs, the name cannot stand in C, or a file cannot be written.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f"name is {name!r}; wanted small letters, digits and underscores")

@@ -88,7 +88,7 @@ def step_and_rays(
 ) -> tuple[State, Result, Request, Hit]:
     """`step`, and its rays with what they hit, as `jaxik.world.terrain.from_hits` wants it.
 
-    For the arguments see `step`; the terrain is none of given hits.
+    For the arguments see `step`; the terrain has to cast its rays itself.
 
     Returns:
         Memory after the frame, the result, all rays (rays) in order, and their hits.
