@@ -19,6 +19,7 @@ from .clips import save_clip as save_clip
 from .clips.clip_frames import frames_from_clip as frames_from_clip
 from .codegen.export import GoldenTrace as GoldenTrace
 from .codegen.export import export_c as export_c
+from .codegen.export import export_system as export_system
 from .experiment.experiment import Experiment as Experiment
 from .experiment.experiment_files import load_experiment as load_experiment
 from .experiment.in_memory import clip_entry as clip_entry

@@ -30,6 +30,7 @@ from .terminal import show
 if TYPE_CHECKING:
     from jaxik.record import Reading, Record
 
+LANGUAGES = ("c",)  # of code
 TEMPLATE = Path()
 """What `--joints` is without a file: no name that a file can have."""
 
@@ -248,15 +249,15 @@ record = Command(
     ),
     output("FILE", ".toml, .json, .csv or .bin"),
     argument(
-        "--as", dest="form", choices=("ozz", "unreal", "mec", "c"),
-        help="write the settings of this system, or C code (default: parameters, or a record)",
+        "--as", dest="form", choices=("ozz", "unreal", "mec", *LANGUAGES),
+        help="write the settings of this system, or code (default: parameters, or a record)",
     ),
     flag("--drop", "leave out what the record or settings cannot hold"),
     group(
-        "of C code",
+        "of code",
         argument(
             "--trace", type=Path, metavar="CLIP",
-            help="also write what the system makes of this clip, and check.c, which replays it",
+            help="also write what the system makes of this clip, and a program that replays it",
         ),
         argument(
             "--terrain", type=Path, metavar="MESH",
@@ -288,10 +289,10 @@ def export(options: argparse.Namespace) -> int:
 
     code = {name: getattr(options, name) for name in ("trace", "terrain", "legs", "name")}
     wanted = [f"--{name}" for name, value in code.items() if value is not None]
-    if options.form == "c":
+    if options.form in LANGUAGES:
         _export_code(options)
     elif wanted:
-        raise ValueError(f"{', '.join(wanted)}: only for C code; wanted --as c as well")
+        raise ValueError(f"{', '.join(wanted)}: only for code; wanted --as c as well")
     else:
         jobs.export(options.source, options.output, system=options.form, drop=options.drop)
     print(f"written to {options.output}")
@@ -303,7 +304,7 @@ def _export_code(options: argparse.Namespace) -> None:
     from fitting.studies.animations import AnimationFiles
 
     if options.drop:
-        raise ValueError("--drop: only for a record and for settings; C code holds everything")
+        raise ValueError("--drop: only for a record and for settings; code holds everything")
     if (options.trace is None) != (options.terrain is None):
         raise ValueError("--trace and --terrain belong together: a clip and the ground under it")
     if options.trace is not None and options.legs is not None:
@@ -311,5 +312,5 @@ def _export_code(options: argparse.Namespace) -> None:
     trace = None if options.trace is None else AnimationFiles(options.trace, options.terrain)
     jobs.export_code(
         options.source, options.output,
-        name=options.name or "footik", legs=options.legs or 2, trace=trace,
+        language=options.form, name=options.name or "footik", legs=options.legs or 2, trace=trace,
     )  # fmt: skip

@@ -1,20 +1,16 @@
 """The functions of a program in C99 that is also C++11."""
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from string import ascii_lowercase
 
 import numpy as np
 
-from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number
+from .functions import LETTERS, Language, body_of, parts_of
+from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .program import Place, Program
-from .repeats import Cone, Repeats
-from .schedule import Part, Schedule, Target
+from .schedule import Schedule, Target
 
-WIDTH = 110  # of an expression, from which it gets a name of its own
 C_TYPES = {FLOAT: "float", INT: "int", UNSIGNED: "unsigned", BOOL: "int"}
-LETTERS = {FLOAT: "f", INT: "i", UNSIGNED: "u", BOOL: "b"}
 
 # By operation and type of the operands: an expression of these, or a call of one of HELPERS.
 EXPRESSIONS: dict[tuple[str, str], str] = {
@@ -146,6 +142,28 @@ static unsigned @bits_of_float(float x) {
     return bits;
 }""",
 }
+PRELUDE = """\
+#include <math.h>
+
+#include "@file.h"
+
+#ifdef __FAST_MATH__
+#error "compile without -ffast-math: numbers may be infinite"
+#endif
+#if defined(__GNUC__) && defined(__SSE__)
+#include <xmmintrin.h>
+#define @SSE
+#endif
+#ifdef __GNUC__
+#define @APART __attribute__((noinline))
+#else
+#define @APART
+#endif
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-thread-jumps") /* or minima and maxima become branches */
+#endif
+
+"""
 ARGUMENTS = {  # of the functions, by the name with which an expression begins
     "parameters": "const @parameters *parameters",
     "rig": "const @rig *rig",
@@ -178,25 +196,57 @@ def literal(value: Number) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
+class C(Language):
+    """C99 that is also C++11."""
+
+    name = "C"
+    expressions = EXPRESSIONS
+    helpers = HELPERS
+
+    def literal(self, value: Number) -> str:
+        return literal(value)
+
+    def local(self, kind: str, name: str, text: str) -> str:
+        return f"const {C_TYPES[kind]} {name} = {text};"
+
+    def work(self, kind: str, place: int) -> str:
+        return f"work->{LETTERS[kind]}[{place}]"
+
+    def input(self, place: Place) -> str:
+        if place.struct == "hits":
+            ray, *axis = place.index
+            text = f"hits[{ray}].{place.field.path[0]}" + "".join(f"[{i}]" for i in axis)
+        else:
+            text = _member(place.struct, place)
+        return f"({text} != 0)" if place.field.kind == BOOL else text
+
+    def output(self, target: Target, place: Place | None) -> str:
+        if place is None:
+            axis = f"[{target.axis}]" if target.name in ("origin", "direction") else ""
+            return f"rays[{target.number}].{target.name}{axis}"
+        return _member("after" if place.struct == "state" else place.struct, place)
+
+    def part(self, name: str, lines: Sequence[str]) -> tuple[str, list[str]]:
+        body = body_of(lines)
+        names = [word for word in ARGUMENTS if re.search(rf"\b{word}(->|\[)", body)]
+        heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
+        return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
+
+    def shared(
+        self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]
+    ) -> str:
+        heads = ", ".join(f"{C_TYPES[each]} {letter}" for each, letter in arguments)
+        return f"@APART static {C_TYPES[kind]} {name}({heads}) {{\n{body_of(lines)}\n}}"
+
+
 def functions(program: Program, schedule: Schedule) -> list[str]:
     """The helpers, the parts of all phases, and the functions that others call.
 
     Raises:
         ValueError: an operation on a type for which there is no expression.
     """
-    parts, calls, number, repeats = [], [], 0, schedule.repeats
-    for cone in repeats.functions:
-        parts.append(_shared(program, cone, len(parts)))
-    for phase in schedule.phases:
-        calls.append([])
-        for part in phase:
-            text, arguments = _Function(program, part, repeats).write(f"@part_{number}")
-            parts.append(text)
-            calls[-1].append((f"@part_{number}", arguments))
-            number += 1
-    bodies = "".join(parts)
-    helpers = [text for helper, text in HELPERS.items() if f"@{helper}(" in bodies]
-    return [*helpers, *parts, *_entries(calls)]
+    parts = parts_of(program, schedule, C())
+    return [*parts.helpers, *parts.texts, *_entries(parts.calls)]
 
 
 def signature(phase: int, rounds: int) -> str:
@@ -229,120 +279,6 @@ def _entries(calls: Sequence[Sequence[tuple[str, list[str]]]]) -> Iterator[str]:
             lines.append(f"    {part}({', '.join(passed)});")
         lines += ["    *state = after;"] if changes_state else []
         yield "\n".join([f"{head} {{", *lines, "}"])
-
-
-class _Function:
-    """One part as a function."""
-
-    def __init__(self, program: Program, part: Part, repeats: Repeats) -> None:
-        self.program, self.graph, self.part, self.repeats = program, program.graph, part, repeats
-        self.uses = Counter(node for node in part.writes)
-        for node in part.nodes:
-            operands = repeats.operands(self.graph, node)
-            twice = self._expression(node).count("{0}") > 1
-            self.uses.update(operands * (2 if twice else 1))
-        self.uses.update(node for _, node in part.targets)
-        self.texts: dict[Node, str] = {}
-        self.lines: list[str] = []
-
-    def write(self, name: str) -> tuple[str, list[str]]:
-        """The function, and the names of its arguments."""
-        self.compute()
-        for target, node in self.part.targets:
-            self.lines.append(f"{self._target(target)} = {_bare(self._text(node))};")
-        for node, place in self.part.writes.items():
-            self.lines.append(
-                f"work->{LETTERS[self.graph.types[node]]}[{place}] = {self.texts[node]};"
-            )
-        body = "\n".join(f"    {line}" for line in self.lines)
-        names = [word for word in ARGUMENTS if re.search(rf"\b{word}(->|\[)", body)]
-        heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
-        return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
-
-    def compute(self) -> None:
-        """Writes what computes all nodes, but for the expressions of those that are used once."""
-        for node in self.part.nodes:
-            operands = map(self._text, self.repeats.operands(self.graph, node))
-            text = self._expression(node).format(*operands)
-            single = self.uses[node] == 1 and node not in self.part.writes
-            self.texts[node] = text if single and len(text) < WIDTH else self._named(node, text)
-
-    def _expression(self, node: Node) -> str:
-        if node in self.repeats.calls:
-            number, arguments = self.repeats.calls[node]
-            places = ", ".join(f"{{{place}}}" for place in range(len(arguments)))
-            return f"@shared_{number}({places})"
-        operation, operands = self.graph.operations[node], self.graph.operands[node]
-        key = operation, self.graph.types[operands[-1]]
-        if key not in EXPRESSIONS:
-            raise ValueError(
-                f"C has no rule for the operation {key[0]!r} on numbers of type {key[1]}"
-            )
-        return EXPRESSIONS[key]
-
-    def _text(self, node: Node) -> str:
-        """An expression for a node that is there."""
-        if node not in self.texts:
-            if (value := self.graph.values[node]) is not None:
-                self.texts[node] = literal(value)
-            else:
-                if node in self.graph.inputs:
-                    text = _input(self.program.inputs[self.graph.inputs[node]])
-                else:
-                    place = self.part.reads[node]
-                    text = f"work->{LETTERS[self.graph.types[node]]}[{place}]"
-                self.texts[node] = self._named(node, text) if self.uses[node] > 1 else text
-        return self.texts[node]
-
-    def _named(self, node: Node, text: str) -> str:
-        kind = self.graph.types[node]
-        name = f"{LETTERS[kind]}{len(self.lines)}"
-        self.lines.append(f"const {C_TYPES[kind]} {name} = {_bare(text)};")
-        return name
-
-    def _target(self, target: Target) -> str:
-        if target.struct == "rays":
-            axis = f"[{target.axis}]" if target.name in ("origin", "direction") else ""
-            return f"rays[{target.number}].{target.name}{axis}"
-        struct = "state" if target.struct == "init" else target.struct
-        place = self.program.places[struct][target.number]
-        return _member("after" if struct == "state" else struct, place)
-
-
-def _shared(program: Program, cone: Cone, number: int) -> str:
-    """What occurs often as a function."""
-    types = program.graph.types
-    function = _Function(program, Part(list(cone.nodes), []), Repeats([], {}))
-    heads = []
-    for letter, argument in zip(ascii_lowercase, cone.arguments, strict=False):
-        function.texts[argument] = letter
-        heads.append(f"{C_TYPES[types[argument]]} {letter}")
-    function.compute()
-    lines = [*function.lines, f"return {_bare(function.texts[cone.nodes[-1]])};"]
-    body = "\n".join(f"    {line}" for line in lines)
-    kind = C_TYPES[types[cone.nodes[-1]]]
-    return f"@APART static {kind} @shared_{number}({', '.join(heads)}) {{\n{body}\n}}"
-
-
-def _bare(text: str) -> str:
-    """An expression without parentheses around all of it."""
-    if not text.startswith("("):
-        return text
-    depth = 0
-    for position, letter in enumerate(text):
-        depth += (letter == "(") - (letter == ")")
-        if depth == 0:
-            return text[1:-1] if position == len(text) - 1 else text
-    return text
-
-
-def _input(place: Place) -> str:
-    if place.struct == "hits":
-        ray, *axis = place.index
-        text = f"hits[{ray}].{place.field.path[0]}" + "".join(f"[{i}]" for i in axis)
-    else:
-        text = _member(place.struct, place)
-    return f"({text} != 0)" if place.field.kind == BOOL else text
 
 
 def _member(struct: str, place: Place) -> str:

@@ -19,7 +19,7 @@ import jaxik
 from jaxik.pipeline.requests import Request
 from jaxik.world.terrain import Hit
 
-from .export import filled
+from .c_files import filled
 from .memory import rows, tree_of
 from .program import Program, fields_of
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import fitting
 import jaxik
 from fitting.clips.clip_frames import frames_from_clip
-from fitting.codegen.export import GoldenTrace, export_c
+from fitting.codegen.export import GoldenTrace, export_system
 from fitting.codegen.program import blank_rig
 from fitting.experiment import originals, parameter_files, record_files
 from fitting.experiment.experiment import ClipEntry
@@ -89,19 +89,21 @@ def export_code(
     source: str | Path,
     folder: str | Path,
     *,
+    language: str = "c",
     name: str = "footik",
     legs: int = 2,
     trace: AnimationFiles | None = None,
 ) -> None:
-    """Writes a system as C code with the answers of `jaxik.step`; see `fitting.codegen`.
+    """Writes a system as code with the answers of `jaxik.step`; see `fitting.codegen`.
 
     Args:
         source: as for `export`.
         folder: where the files go; it is made if missing.
+        language: as for `fitting.export_system`.
         name: of the files, and prefix of all names in them.
         legs: how many legs a character has; with a trace, as many as in its clip.
-        trace: a clip and its terrain, of which a golden trace is written, with `check.c`, a program
-            that replays it; None writes neither.
+        trace: a clip and its terrain, of which a golden trace is written, with a program that
+            replays it; None writes neither.
 
     Raises:
         ValueError: the source or the clip cannot be read, the system cannot be exported, or the
@@ -116,7 +118,7 @@ def export_code(
         frames = frames_from_clip(trace.flat_clip, floor=trace.floor)
         golden = GoldenTrace(trace.load_terrain(), frames)
     with error_context(source):
-        export_c(loaded.ik, rig, folder, name=name, golden=golden)
+        export_system(loaded.ik, rig, folder, language=language, name=name, golden=golden)
 
 
 def load(source: Path) -> Source:

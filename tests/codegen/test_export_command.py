@@ -57,7 +57,7 @@ def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, paramet
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--legs", "2"], "--legs: only for C code; wanted --as c as well"),
+        (["--legs", "2"], "--legs: only for code; wanted --as c as well"),
         (["--as", "c", "--drop"], "--drop: only for a record and for settings"),
         (["--as", "c", "--trace", BASE], "--trace and --terrain belong together"),
         (["--as", "c", "--name", "Walk!"], "name is 'Walk!'; wanted small letters, digits and"),

@@ -17,7 +17,7 @@ from jaxtyping import Array
 import jaxik
 from fitting.bench import workloads
 from fitting.clips.clip_frames import frames_from_clip
-from fitting.codegen import c_code, export, program, stablehlo, toolchain
+from fitting.codegen import c_code, c_files, export, program, stablehlo, toolchain
 from fitting.codegen.graph import DTYPES, Graph
 from fitting.codegen.toolchain import Compiled, Playback
 from jaxik.maths import parameter_tree, smoothing, vec
@@ -270,7 +270,7 @@ def operations(operands, walk) -> program.Program:
 
 def test_every_operation_gives_the_answers_of_jax(tmp_path, walk, operands, operations):
     rows, expected = operands
-    for file, text in export.texts(operations, "rules").items():
+    for file, text in c_files.sources(operations, "rules").items():
         (tmp_path / file).write_text(text)
     compiled = Compiled(operations, tmp_path, "rules", [compiler("c"), "-O0", *C])
     hits = Hit(*(jnp.zeros((len(rows.x), 0, *size), jnp.float32) for size in ((3,), (3,), (), ())))

@@ -1,0 +1,102 @@
+"""What the comments of generated code say, in any language."""
+
+import ast
+import functools
+import hashlib
+import inspect
+import textwrap
+from collections.abc import Iterator
+from importlib import metadata
+
+import jax
+from jaxtyping import PyTree
+
+from jaxik.maths import parameter_tree
+from jaxik.maths.parameter_tree import Rule
+
+from .memory import words
+from .program import Program
+
+STRUCTS = {
+    "parameters": "The numbers of the system; @defaults has those that it was made from.",
+    "rig": "What a leg is, apart from its pose.",
+    "state": "Memory between frames: @init makes that before the first, @step the next.",
+    "frame": "One frame of animation, before foot IK.",
+    "result": "One frame after foot IK.",
+}
+AXES = """\
+Axes: x left, y up, z forward in model space; metres, seconds, radians; quaternions are w x y z. Of
+names, _ws is world space, _ms model space, and _ls the space of a joint; a_from_b takes points from
+b to a. Flags are 1 or 0."""
+
+
+def origin(program: Program) -> list[str]:
+    """From what a program was made, in a paragraph each."""
+    rules = {
+        stage: getattr(program.ik, stage)
+        for stage in vars(program.ik)
+        if isinstance(getattr(program.ik, stage), Rule)
+    }
+    options = [name for name, on in parameter_tree.options(program.ik).items() if on]
+    listed = ", ".join(f"{stage} {type(rule).__name__}" for stage, rule in rules.items())
+    count = "1 leg" if program.legs == 1 else f"{program.legs} legs"
+    versions = f"jaxik {metadata.version('jaxik')} with JAX {jax.__version__}"
+    ups = ", ".join(str(tuple(up.round(6).tolist())) for up in program.ups)
+    head = [
+        f"Foot IK of {count}, made by {versions}. Do not edit.",
+        f"System: {listed}; with {', '.join(options) or 'no options'}.",
+        f"Parameters: {digest(program.ik)}, the digest of their numbers.",
+        f"Up, of the body and of legs that have their own: {ups}.",
+    ]
+    if program.order != sorted(program.order):
+        numbers = " ".join(map(str, program.order))
+        head.append(f"In `jaxik.step`, the rays have the numbers {numbers}.")
+    return head
+
+
+def digest(tree: PyTree) -> str:
+    """A few letters that tell the numbers of one system from those of another."""
+    return hashlib.sha256(words(tree)).hexdigest()[:16]
+
+
+def meanings(tree: PyTree) -> dict[tuple[str, ...], str]:
+    """What the fields of a tree of structs are, by their paths."""
+    if isinstance(tree, Rule):
+        return {tuple(name.split(".")): text for name, text in _of_parameters(tree).items()}
+    return dict(_of_fields(tree, ()))
+
+
+def _of_parameters(ik: Rule) -> dict[str, str]:
+    declared, texts = parameter_tree.declarations(ik), parameter_tree.docs(ik)
+    for name, declaration in declared.items():
+        unit = "" if declaration.unit == "1" else f"{declaration.unit}, "
+        texts[name] = f"{unit}{declaration.low:g} to {declaration.high:g}: {texts[name]}"
+    for slot in parameter_tree.slots(ik):
+        if slot.name not in declared and slot.unit != "1":
+            texts[slot.name] = f"{slot.unit}: {texts[slot.name]}"
+    return texts
+
+
+def _of_fields(tree: PyTree, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], str]]:
+    texts = _field_texts(type(tree))
+    for name, value in vars(tree).items():
+        if name in texts:
+            yield (*path, name), texts[name]
+        if hasattr(value, "__dataclass_fields__"):
+            yield from _of_fields(value, (*path, name))
+
+
+@functools.cache
+def _field_texts(cls: type) -> dict[str, str]:
+    """The strings below the fields of a class, and of those that it extends."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if base.__module__.split(".")[0] in ("builtins", "equinox", "abc"):
+            continue
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, below in zip(definition.body, definition.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                if isinstance(field.target, ast.Name) and isinstance(below.value, ast.Constant):
+                    texts[field.target.id] = " ".join(str(below.value.value).split())
+    return texts
