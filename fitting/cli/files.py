@@ -268,6 +268,10 @@ record = Command(
             help="of a character (default: those of the clip, or 2)",
         ),
         argument("--name", metavar="NAME", help="prefix of all names (default: footik)"),
+        argument(
+            "--axes", choices=("unreal", "unity", "godot"),
+            help="convert from the axes and units of this engine, and back",
+        ),
     ),
 )  # fmt: skip
 def export(options: argparse.Namespace) -> int:
@@ -287,7 +291,7 @@ def export(options: argparse.Namespace) -> int:
     """
     from fitting import jobs
 
-    code = {name: getattr(options, name) for name in ("trace", "terrain", "legs", "name")}
+    code = {name: getattr(options, name) for name in ("trace", "terrain", "legs", "name", "axes")}
     wanted = [f"--{name}" for name, value in code.items() if value is not None]
     if options.form in LANGUAGES:
         _export_code(options)
@@ -312,5 +316,6 @@ def _export_code(options: argparse.Namespace) -> None:
     trace = None if options.trace is None else AnimationFiles(options.trace, options.terrain)
     jobs.export_code(
         options.source, options.output,
-        language=options.form, name=options.name or "footik", legs=options.legs or 2, trace=trace,
+        language=options.form, name=options.name or "footik", axes=options.axes,
+        legs=options.legs or 2, trace=trace,
     )  # fmt: skip

@@ -5,9 +5,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .functions import LETTERS, Language, body_of, parts_of
+from .functions import LETTERS, Language, body_of, helpers_in, parts_of, routine_of
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .program import Place, Program
+from .routines import PLATFORM, Routine, routines
 from .schedule import Schedule, Target
 
 C_TYPES = {FLOAT: "float", INT: "int", UNSIGNED: "unsigned", BOOL: "int"}
@@ -213,6 +214,8 @@ class C(Language):
         return f"work->{LETTERS[kind]}[{place}]"
 
     def input(self, place: Place) -> str:
+        if place.struct == PLATFORM:
+            return PLATFORM
         if place.struct == "hits":
             ray, *axis = place.index
             text = f"hits[{ray}].{place.field.path[0]}" + "".join(f"[{i}]" for i in axis)
@@ -232,6 +235,9 @@ class C(Language):
         heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
         return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
 
+    def routine(self, routine: Routine, lines: Sequence[str]) -> str:
+        return f"{routine_head(routine)} {{\n{body_of(lines)}\n}}"
+
     def shared(
         self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]
     ) -> str:
@@ -246,7 +252,9 @@ def functions(program: Program, schedule: Schedule) -> list[str]:
         ValueError: an operation on a type for which there is no expression.
     """
     parts = parts_of(program, schedule, C())
-    return [*parts.helpers, *parts.texts, *_entries(parts.calls)]
+    around = [routine_of(routine, C()) for routine in routines(program)]
+    bodies = "".join([*parts.texts, *around])
+    return [*helpers_in(C(), bodies), *parts.texts, *_entries(parts.calls), *around]
 
 
 def signature(phase: int, rounds: int) -> str:
@@ -262,6 +270,17 @@ def signature(phase: int, rounds: int) -> str:
     inputs[2] = "@state *state"
     more = [*inputs, *hits, ARGUMENTS["work"], ARGUMENTS["result"]]
     return f"void @step({', '.join(more)})"
+
+
+def routine_head(routine: Routine) -> str:
+    """The head of a routine."""
+    inputs = [
+        "int platform" if name == PLATFORM else f"const @{struct} *{name}"
+        for name, struct in routine.reads
+        if name != routine.writes.name
+    ]
+    written = f"@{routine.writes.struct} *{routine.writes.name}"
+    return f"void @{routine.name}({', '.join([*inputs, written])})"
 
 
 def _entries(calls: Sequence[Sequence[tuple[str, list[str]]]]) -> Iterator[str]:

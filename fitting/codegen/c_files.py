@@ -9,11 +9,15 @@ from .program import Program
 CHECK = "check.c"
 
 
-def sources(program: Program, name: str) -> dict[str, str]:
-    """The header and the functions, by the names of their files."""
+def sources(program: Program, name: str, engine: str | None = None) -> dict[str, str]:
+    """The header and the functions, by the names of their files; see `export.Language`."""
     schedule = program.schedule()
-    parts = [c_code.PRELUDE + header.defaults(program), *c_code.functions(program, schedule)]
-    contents = {f"{name}.h": header.text(program, schedule), f"{name}.c": "\n\n".join(parts) + "\n"}
+    constants = "\n\n".join(header.constants(program))
+    parts = [c_code.PRELUDE + constants, *c_code.functions(program, schedule)]
+    contents = {
+        f"{name}.h": header.text(program, schedule, engine),
+        f"{name}.c": "\n\n".join(parts) + "\n",
+    }
     return {file: filled(text, program, name) for file, text in contents.items()}
 
 

@@ -12,6 +12,7 @@ from fitting.runtime import activity, files
 from jaxik.world.terrain import LegTerrains, Terrain
 
 from . import c_files, trace
+from .axes import ENGINES
 from .program import Program, build
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -21,8 +22,8 @@ TRACE = "trace.bin"
 class Language(NamedTuple):
     """What writes the files of a program: their texts by their names."""
 
-    sources: Callable[[Program, str], dict[str, str]]
-    """Of a program and the prefix of all names."""
+    sources: Callable[[Program, str, str | None], dict[str, str]]
+    """Of a program, the prefix of all names, and the engine whose axes it converts."""
     check: Callable[[Program, str], dict[str, str]]
     """What replays a golden trace."""
 
@@ -44,6 +45,7 @@ def export_system(
     *,
     language: str = "c",
     name: str = "footik",
+    axes: str | None = None,
     terrain: Terrain | LegTerrains | None = None,
     frame: jaxik.Frame | None = None,
     golden: GoldenTrace | None = None,
@@ -59,6 +61,7 @@ def export_system(
         folder: where the files go; it is made if missing.
         language: one of `LANGUAGES`.
         name: of the files, and prefix of all names in them.
+        axes: one of `axes.ENGINES`, for conversions from and to its axes; None writes none.
         terrain: whose up directions and number of platforms are fixed; None is that of the trace
             or, without one, still ground under (0, 1, 0).
         frame: a single frame with the optional fields that the written frame is to have; None takes
@@ -76,6 +79,8 @@ def export_system(
         raise ValueError(f"language is {language!r}; wanted one of {list(LANGUAGES)}")
     if not NAME.fullmatch(name):
         raise ValueError(f"name is {name!r}; wanted small letters, digits and underscores")
+    if axes is not None and axes not in ENGINES:
+        raise ValueError(f"axes is {axes!r}; wanted one of {list(ENGINES)}")
     folder = Path(folder)
     if golden is not None:
         golden = golden._replace(frames=trace.with_restart(golden.frames))
@@ -84,7 +89,7 @@ def export_system(
             frame = jax.tree.map(lambda leaf: leaf[0], golden.frames)
     with activity.announced("Generating code"):
         program = build(ik, rig, terrain, frame)
-        texts = LANGUAGES[language].sources(program, name)
+        texts = LANGUAGES[language].sources(program, name, axes)
     folder.mkdir(parents=True, exist_ok=True)
     if golden is not None:
         texts |= LANGUAGES[language].check(program, name)

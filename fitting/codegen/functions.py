@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from string import ascii_lowercase
 from typing import NamedTuple
 
-from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number
+from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number, needed
 from .program import Place, Program
 from .repeats import Cone, Repeats
-from .schedule import Part, Schedule, Target
+from .routines import Routine
+from .schedule import Part, Schedule, Target, is_free
 
 WIDTH = 110  # of an expression, from which it gets a name of its own
 LETTERS = {FLOAT: "f", INT: "i", UNSIGNED: "u", BOOL: "b"}
@@ -53,6 +54,10 @@ class Language(abc.ABC):
         """A function without a result, and the arguments that it has to be given."""
 
     @abc.abstractmethod
+    def routine(self, routine: Routine, lines: Sequence[str]) -> str:
+        """A function that others call."""
+
+    @abc.abstractmethod
     def shared(
         self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]
     ) -> str:
@@ -62,8 +67,6 @@ class Language(abc.ABC):
 class Parts(NamedTuple):
     """The functions of all phases."""
 
-    helpers: list[str]
-    """Those that are called."""
     texts: list[str]
     calls: list[list[tuple[str, list[str]]]]
     """Of each phase: the names of its functions, with what each has to be given."""
@@ -81,18 +84,34 @@ def parts_of(program: Program, schedule: Schedule, language: Language) -> Parts:
     for phase in schedule.phases:
         calls.append([])
         for part in phase:
-            text, arguments = _Function(program, language, part, repeats).write(f"@part_{number}")
+            lines = _Function(program, language, part, repeats).write()
+            text, arguments = language.part(f"@part_{number}", lines)
             texts.append(text)
             calls[-1].append((f"@part_{number}", arguments))
             number += 1
-    bodies = "".join(texts)
-    helpers = [text for helper, text in language.helpers.items() if f"@{helper}(" in bodies]
-    return Parts(helpers, texts, calls)
+    return Parts(texts, calls)
+
+
+def helpers_in(language: Language, text: str) -> list[str]:
+    """The helpers that this code calls."""
+    return [body for name, body in language.helpers.items() if f"@{name}(" in text]
 
 
 def fill(template: str, fillings: Mapping[str, str]) -> str:
     """A text with each of these words, in this order, replaced."""
     return functools.reduce(lambda text, pair: text.replace(*pair), fillings.items(), template)
+
+
+def routine_of(routine: Routine, language: Language) -> str:
+    """A routine in a language.
+
+    Raises:
+        ValueError: an operation on a type for which there is no expression.
+    """
+    graph = routine.graph
+    nodes = sorted(needed(graph, [node for _, node in routine.targets]))
+    part = Part([node for node in nodes if not is_free(graph, node)], routine.targets)
+    return language.routine(routine, _Function(routine, language, part, Repeats([], {})).write())
 
 
 def body_of(lines: Sequence[str]) -> str:
@@ -101,9 +120,11 @@ def body_of(lines: Sequence[str]) -> str:
 
 
 class _Function:
-    """One part as a function."""
+    """The lines of one part."""
 
-    def __init__(self, program: Program, language: Language, part: Part, repeats: Repeats) -> None:
+    def __init__(
+        self, program: Program | Routine, language: Language, part: Part, repeats: Repeats
+    ) -> None:
         self.program, self.graph, self.part, self.repeats = program, program.graph, part, repeats
         self.language = language
         self.uses = Counter(node for node in part.writes)
@@ -115,15 +136,15 @@ class _Function:
         self.texts: dict[Node, str] = {}
         self.lines: list[str] = []
 
-    def write(self, name: str) -> tuple[str, list[str]]:
-        """The function, and the names of its arguments."""
+    def write(self) -> list[str]:
+        """All lines."""
         self.compute()
         for target, node in self.part.targets:
             self.lines.append(f"{self._output(target)} = {bare(self._text(node))};")
         for node, place in self.part.writes.items():
             target = self.language.work(self.graph.types[node], place)
             self.lines.append(f"{target} = {self.texts[node]};")
-        return self.language.part(name, self.lines)
+        return self.lines
 
     def compute(self) -> None:
         """Writes what computes all nodes, but for the expressions of those that are used once."""

@@ -7,13 +7,15 @@ from itertools import groupby
 import jax
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
-from .c_code import C_TYPES, literal, signature
+from .axes import ENGINES, conversions
+from .c_code import C_TYPES, literal, routine_head, signature
 from .functions import LETTERS
 from .graph import Number
 from .meanings import AXES, STRUCTS, meanings, origin
-from .program import Field, Program
+from .program import Field, Program, blank_value
+from .routines import routines
 from .schedule import Schedule
 
 COLUMNS = 96
@@ -30,7 +32,7 @@ allocated, and there is no other memory: characters may be computed in parallel.
 with -ffast-math."""
 
 
-def text(program: Program, schedule: Schedule) -> str:
+def text(program: Program, schedule: Schedule, engine: str | None) -> str:
     """The header; each @ stands for the prefix of all names, and @NAME for it in capitals."""
     guard, rounds = "@NAME_H", len(program.rounds)
     counts = {"LEGS": program.legs, "RAYS": program.ray_count, "ROUNDS": rounds}
@@ -51,8 +53,17 @@ def text(program: Program, schedule: Schedule) -> str:
         *_work(schedule),
         "extern const @parameters @defaults;",
         "",
+        *_comment(["A frame to begin with: full foot IK, on the ground, footholds unknown."]),
+        "extern const @frame @blank_frame;",
+        "",
         *functions,
         "",
+        *(
+            line
+            for routine in routines(program)
+            for line in (*_comment([routine.meaning]), f"{routine_head(routine)};", "")
+        ),
+        *(_axes(engine) if engine else ()),
         "#ifdef __cplusplus\n}\n#endif",
         "",
         "#endif",
@@ -61,21 +72,48 @@ def text(program: Program, schedule: Schedule) -> str:
     return "\n".join(lines)
 
 
-def defaults(program: Program) -> str:
-    """The values of the parameters that the program was made from, as a constant of C."""
-    values = iter(np.asarray(leaf, _dtype(leaf)) for leaf in jax.tree.leaves(program.ik))
-    body = _initialiser(program.fields("parameters"), values, 0)
-    return f"const @parameters @defaults = {body};"
+def constants(program: Program) -> list[str]:
+    """The parameters that the program was made from, and a frame to begin with."""
+    frame = [blank_value(field) for field in program.fields("frame")]
+    return [
+        _constant(program, "parameters", "defaults", jax.tree.leaves(program.ik)),
+        _constant(program, "frame", "blank_frame", frame),
+    ]
 
 
-def _dtype(leaf: jax.Array) -> DTypeLike:
-    return np.float32 if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
+def _constant(program: Program, struct: str, name: str, leaves: Sequence[ArrayLike]) -> str:
+    pairs = zip(program.fields(struct), leaves, strict=True)
+    filled = [(field, np.asarray(leaf, _dtype(leaf))) for field, leaf in pairs if field.size]
+    body = _initialiser([field for field, _ in filled], (value for _, value in filled), 0)
+    return f"const @{struct} @{name} = {body};"
+
+
+def _dtype(leaf: ArrayLike) -> DTypeLike:
+    dtype = np.asarray(leaf).dtype
+    return np.float32 if np.issubdtype(dtype, np.floating) else dtype
 
 
 def _head(program: Program) -> list[str]:
     moving = ", and to its platform the number of what moves, or -1" if program.platforms else ""
     use = USE.format(calls="\n".join(calls(program, "    ")), platforms=moving)
     return [*origin(program), *use.split("\n\n"), AXES]
+
+
+def _axes(engine: str) -> Iterator[str]:
+    """Conversions from the axes of an engine and back, as functions of a header."""
+    yield from _comment([
+        f"{engine.capitalize()}: {ENGINES[engine].meaning}; quaternions are x y z w. Model space "
+        "and world space are converted alike, and rotations of joints."
+    ])  # fmt: skip
+    for name, source, parts in conversions(engine):
+        arguments = f"const float {source}[{len(parts)}], float to[{len(parts)}]"
+        yield f"static inline void @{name}({arguments}) {{"
+        for number, (index, factor) in enumerate(parts):
+            sign, size = "-" if factor < 0 else "", literal(np.float32(abs(factor)))
+            by = "" if abs(factor) == 1.0 else f" * {size}"
+            yield f"    to[{number}] = {sign}{source}[{index}]{by};"
+        yield "}"
+    yield ""
 
 
 def calls(program: Program, indent: str, prefix: str = "&") -> list[str]:

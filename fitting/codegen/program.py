@@ -131,6 +131,14 @@ def blank_frame(legs: int, platforms: int = 0) -> jaxik.Frame:
     )  # fmt: skip
 
 
+def blank_value(field: Field) -> np.ndarray:
+    """What a frame to begin with has in a field: full foot IK, on the ground, footholds unknown."""
+    if field.path[-1] == "rot":
+        return np.broadcast_to(np.array([1.0, 0.0, 0.0, 0.0], np.float32), field.shape)
+    ones = field.path[-1] in ("weight", "grounded", "standing", "stride_scale")
+    return np.full(field.shape, ones, np.float32 if field.kind == FLOAT else np.int32)
+
+
 def blank_rig(legs: int) -> jaxik.Rig:
     """A rig without measures, as an example of how many legs there are."""
     zeros = jnp.zeros(legs, jnp.float32)

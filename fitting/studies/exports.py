@@ -91,6 +91,7 @@ def export_code(
     *,
     language: str = "c",
     name: str = "footik",
+    axes: str | None = None,
     legs: int = 2,
     trace: AnimationFiles | None = None,
 ) -> None:
@@ -101,6 +102,7 @@ def export_code(
         folder: where the files go; it is made if missing.
         language: as for `fitting.export_system`.
         name: of the files, and prefix of all names in them.
+        axes: as for `fitting.export_system`.
         legs: how many legs a character has; with a trace, as many as in its clip.
         trace: a clip and its terrain, of which a golden trace is written, with a program that
             replays it; None writes neither.
@@ -118,7 +120,9 @@ def export_code(
         frames = frames_from_clip(trace.flat_clip, floor=trace.floor)
         golden = GoldenTrace(trace.load_terrain(), frames)
     with error_context(source):
-        export_system(loaded.ik, rig, folder, language=language, name=name, golden=golden)
+        export_system(
+            loaded.ik, rig, folder, language=language, name=name, axes=axes, golden=golden
+        )
 
 
 def load(source: Path) -> Source:
