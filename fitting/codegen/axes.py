@@ -39,7 +39,7 @@ class Axes(NamedTuple):
 ENGINES = {
     "unreal": Axes("x forward, y right, z up, cm, left-handed", ((1, -1), (2, 1), (0, 1)), 0.01),
     "unity": Axes("x right, y up, z forward, m, left-handed", ((0, -1), (1, 1), (2, 1)), 1.0),
-    "godot": Axes("x right, y up, z back, m, right-handed", ((0, -1), (1, 1), (2, -1)), 1.0),
+    "godot": Axes("as ours: models face z; m, right-handed", ((0, 1), (1, 1), (2, 1)), 1.0),
 }
 
 

@@ -6,31 +6,42 @@ from . import c_code, header
 from .functions import fill
 from .program import Program
 
-CHECK = "check.c"
+FOLDER = Path(__file__).parent
+CHECK, WALK = "check.c", "walk.c"
+NODES = {"unreal": ("unreal.h", "AnimNode_@Name.h"), "godot": ("godot.cpp", "@file_modifier.cpp")}
+"""For an engine: what calls the code there, and the name of its file."""
 
 
 def sources(program: Program, name: str, engine: str | None = None) -> dict[str, str]:
-    """The header and the functions, by the names of their files; see `export.Language`."""
+    """The header, the functions and the node of an engine; see `export.Language`."""
     schedule = program.schedule()
     constants = "\n\n".join(header.constants(program))
     parts = [c_code.PRELUDE + constants, *c_code.functions(program, schedule)]
     contents = {
-        f"{name}.h": header.text(program, schedule, engine),
-        f"{name}.c": "\n\n".join(parts) + "\n",
+        "@file.h": header.text(program, schedule, engine),
+        "@file.c": "\n\n".join(parts) + "\n",
     }
-    return {file: filled(text, program, name) for file, text in contents.items()}
+    if engine in NODES:
+        template, file = NODES[engine]
+        contents[file] = (FOLDER / "engines" / template).read_text(encoding="utf-8")
+    return {
+        filled(file, program, name): filled(text, program, name) for file, text in contents.items()
+    }
 
 
 def check(program: Program, name: str) -> dict[str, str]:
-    """What replays a trace of this program."""
-    template = Path(__file__).with_name(CHECK).read_text(encoding="utf-8")
-    return {CHECK: filled(template, program, name)}
+    """What replays a trace of this program, and what walks its animation over another ground."""
+    paths = FOLDER / CHECK, FOLDER / "engines" / WALK
+    return {path.name: filled(path.read_text(encoding="utf-8"), program, name) for path in paths}
 
 
 def filled(template: str, program: Program, name: str) -> str:
     """A text in C with the names of a program, and the calls of a frame, in it."""
     calls = {
         "@CALLS": "\n".join(header.calls(program, "        ")),
+        "@CASTING": "\n".join(header.calls(program, "        ", casts=True)),
         "@POINTED": "\n".join(header.calls(program, "        ", "")),
+        "@STILL": " hits[i].platform = -1;" if program.platforms else "",
     }
-    return fill(template, calls | {"@NAME": name.upper(), "@file": name, "@": f"{name}_"})
+    names = {"@NAME": name.upper(), "@Name": name.title().replace("_", ""), "@file": name}
+    return fill(template, calls | names | {"@": f"{name}_"})

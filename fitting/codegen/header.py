@@ -116,16 +116,23 @@ def _axes(engine: str) -> Iterator[str]:
     yield ""
 
 
-def calls(program: Program, indent: str, prefix: str = "&") -> list[str]:
-    """The calls of a frame, of variables or, without the prefix, of pointers."""
+def calls(program: Program, indent: str, prefix: str = "&", *, casts: bool = False) -> list[str]:
+    """The calls of a frame, of variables or, without the prefix, of pointers.
+
+    Where it `casts`, a call `cast(first, end)` follows the rays of each round.
+    """
 
     def arguments(phase: int) -> str:
         structs = ", ".join(f"{prefix}{name}" for name in ("parameters", "rig", "state", "frame"))
         return f"{structs}, {'hits, ' if phase > 1 else ''}{prefix}work"
 
-    rounds = len(program.rounds)
-    rays = [f"{indent}@rays_{i}({arguments(i)}, rays);" for i in range(1, rounds + 1)]
-    return [*rays, f"{indent}@step({arguments(rounds + 1)}, {prefix}result);"]
+    lines, first = [], 0
+    for phase, rays in enumerate(program.rounds, 1):
+        lines.append(f"@rays_{phase}({arguments(phase)}, rays);")
+        lines += [f"cast({first}, {first + len(rays)});"] if casts else []
+        first += len(rays)
+    lines.append(f"@step({arguments(len(program.rounds) + 1)}, {prefix}result);")
+    return [f"{indent}{line}" for line in lines]
 
 
 def _comment(paragraphs: Sequence[str], indent: str = "") -> list[str]:

@@ -19,7 +19,7 @@ from fitting.codegen.axes import ENGINES, conversions
 AXES = {
     "unreal": ([(0, 0, 1), (-1, 0, 0), (0, 1, 0)], 0.01),  # forward, right, up
     "unity": ([(-1, 0, 0), (0, 1, 0), (0, 0, 1)], 1.0),  # right, up, forward
-    "godot": ([(-1, 0, 0), (0, 1, 0), (0, 0, -1)], 1.0),  # right, up, back
+    "godot": ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], 1.0),  # MODEL_LEFT, up, MODEL_FRONT
 }
 
 

@@ -2,6 +2,7 @@
 
 import subprocess
 
+import numpy as np
 import pytest
 
 from fitting.cli import main
@@ -28,7 +29,7 @@ def test_a_trace_of_a_clip_is_replayed_by_a_program_in_c(tmp_path, parameters, c
     words += ["--trace", tmp_path / "walk.npz", "--terrain", GROUND]
     assert main.main([str(word) for word in words]) == 0
     assert f"written to {folder}" in capsys.readouterr().out
-    files = {"walker.h", "walker.c", "check.c", "trace.bin"}
+    files = {"walker.h", "walker.c", "check.c", "walk.c", "trace.bin"}
     assert {path.name for path in folder.iterdir()} == files
     assert len((folder / "check.c").read_text().splitlines()) < 60
     compiler = toolchain.compiler("c")
@@ -38,6 +39,11 @@ def test_a_trace_of_a_clip_is_replayed_by_a_program_in_c(tmp_path, parameters, c
     subprocess.run(build, cwd=folder, check=True)
     done = subprocess.run(["./check"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("5 frames, largest difference ")
+    build[-1], build[5] = "walk", "walk.c"
+    subprocess.run(build, cwd=folder, check=True)
+    done = subprocess.run(["./walk"], cwd=folder, capture_output=True, text=True, check=True)
+    ankles = np.loadtxt(done.stdout.splitlines())
+    assert ankles.shape == (5, 7) and 0.02 < ankles[:, [2, 5]].min()  # number, then two places
     damaged = bytearray((folder / "trace.bin").read_bytes())
     damaged[-40:-36] = b"\0\0\0\x42"  # a number of the last result
     (folder / "trace.bin").write_bytes(damaged)

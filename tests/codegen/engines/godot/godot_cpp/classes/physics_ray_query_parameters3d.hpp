@@ -1,0 +1,1 @@
+/* In skeleton_modifier3d.hpp. */

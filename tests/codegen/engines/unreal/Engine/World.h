@@ -1,0 +1,1 @@
+/* In AnimNode_SkeletalControlBase.h. */
