@@ -261,7 +261,7 @@ record = Command(
         ),
         argument(
             "--terrain", type=Path, metavar="MESH",
-            help="under that clip: .ply, .obj, .glb, ..., or heights as .npz, .npy, .png",
+            help="under that clip: .ply, .obj, ..., .npz, .npy, .png (default: a level floor)",
         ),
         argument(
             "--legs", type=count(1, 64), metavar="N",
@@ -305,17 +305,15 @@ def export(options: argparse.Namespace) -> int:
 
 def _export_code(options: argparse.Namespace) -> None:
     from fitting import jobs
-    from fitting.studies.animations import AnimationFiles
 
     if options.drop:
         raise ValueError("--drop: only for a record and for settings; code holds everything")
-    if (options.trace is None) != (options.terrain is None):
-        raise ValueError("--trace and --terrain belong together: a clip and the ground under it")
+    if options.trace is None and options.terrain is not None:
+        raise ValueError("--terrain: the ground under a clip; wanted --trace CLIP as well")
     if options.trace is not None and options.legs is not None:
         raise ValueError("--legs: a trace has the legs of its clip; leave out one of the two")
-    trace = None if options.trace is None else AnimationFiles(options.trace, options.terrain)
     jobs.export_code(
         options.source, options.output,
         language=options.form, name=options.name or "footik", axes=options.axes,
-        legs=options.legs or 2, trace=trace,
+        legs=options.legs or 2, trace=options.trace, terrain=options.terrain,
     )  # fmt: skip

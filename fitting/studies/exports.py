@@ -17,13 +17,14 @@ from fitting.codegen.program import blank_rig
 from fitting.experiment import originals, parameter_files, record_files
 from fitting.experiment.experiment import ClipEntry
 from fitting.experiment.systems import Preset
+from fitting.ground.meshes import load_terrain
+from fitting.motion.flat_animation import load_flat_animation
 from fitting.runtime import files
 from fitting.runtime.declarations import PATH, keys
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import check_keys, error_context
 from jaxik import record
 
-from .animations import AnimationFiles
 from .fit import run_folder
 
 OURS = (".toml", ".json", ".csv", ".bin")  # parameters, parameters, record, record
@@ -93,7 +94,8 @@ def export_code(
     name: str = "footik",
     axes: str | None = None,
     legs: int = 2,
-    trace: AnimationFiles | None = None,
+    trace: Path | None = None,
+    terrain: Path | None = None,
 ) -> None:
     """Writes a system as code with the answers of `jaxik.step`; see `fitting.codegen`.
 
@@ -104,8 +106,9 @@ def export_code(
         name: of the files, and prefix of all names in them.
         axes: as for `fitting.export_system`.
         legs: how many legs a character has; with a trace, as many as in its clip.
-        trace: a clip and its terrain, of which a golden trace is written, with a program that
-            replays it; None writes neither.
+        trace: a clip of which a golden trace is written, with a program that replays it; None
+            writes neither.
+        terrain: under that clip; None is a level floor.
 
     Raises:
         ValueError: the source or the clip cannot be read, the system cannot be exported, or the
@@ -116,9 +119,9 @@ def export_code(
     if trace is None:
         rig, golden = blank_rig(legs), None
     else:
-        rig = trace.flat_clip.rig
-        frames = frames_from_clip(trace.flat_clip, floor=trace.floor)
-        golden = GoldenTrace(trace.load_terrain(), frames)
+        clip = load_flat_animation(trace)
+        ground = jaxik.world.terrain.plane() if terrain is None else load_terrain(terrain)
+        rig, golden = clip.rig, GoldenTrace(ground, frames_from_clip(clip))
     with error_context(source):
         export_system(
             loaded.ik, rig, folder, language=language, name=name, axes=axes, golden=golden

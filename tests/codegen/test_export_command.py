@@ -65,7 +65,8 @@ def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, paramet
     [
         (["--legs", "2"], "--legs: only for code; wanted --as c as well"),
         (["--as", "c", "--drop"], "--drop: only for a record and for settings"),
-        (["--as", "c", "--trace", BASE], "--trace and --terrain belong together"),
+        (["--as", "c", "--terrain", GROUND], "--terrain: the ground under a clip; wanted --trace"),
+        (["--as", "c", "--trace", "none.npz"], "none.npz"),
         (["--as", "c", "--name", "Walk!"], "name is 'Walk!'; wanted small letters, digits and"),
         (["--as", "c", "--trace", BASE, "--terrain", GROUND, "--legs", "3"], "--legs: a trace has"),
     ],
