@@ -1,5 +1,6 @@
 """The header of a program in C: structs with units and meanings, and the parameters' values."""
 
+import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
@@ -13,7 +14,7 @@ from .axes import ENGINES, conversions
 from .c_code import C_TYPES, literal, routine_head, signature
 from .functions import LETTERS
 from .graph import Number
-from .meanings import AXES, STRUCTS, meanings, origin
+from .meanings import AXES, STRUCTS, meanings, origin, table
 from .program import Field, Program, blank_value
 from .routines import routines
 from .schedule import Schedule
@@ -36,6 +37,7 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
     """The header; each @ stands for the prefix of all names, and @NAME for it in capitals."""
     guard, rounds = "@NAME_H", len(program.rounds)
     counts = {"LEGS": program.legs, "RAYS": program.ray_count, "ROUNDS": rounds}
+    counts["SLIDERS"] = len(table(program))
     counts |= {f"RAYS_{i}": len(rays) for i, rays in enumerate(program.rounds, 1)}
     functions = [f"{signature(phase, rounds)};" for phase in range(rounds + 2)]
     lines = [
@@ -52,6 +54,14 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
         *_comment(["What a frame keeps between its functions."]),
         *_work(schedule),
         "extern const @parameters @defaults;",
+        "",
+        *_comment(["A parameter, for a panel of sliders: the number of those in @parameters."]),
+        "typedef struct @slider {",
+        "    int number; /* each takes four bytes */",
+        "    const char *name, *unit, *meaning;",
+        "    float value, low, high; /* the default and the range; a switch has 0 to 1 */",
+        "} @slider;",
+        "extern const @slider @sliders[@NAME_SLIDERS];",
         "",
         *_comment(["A frame to begin with: full foot IK, on the ground, footholds unknown."]),
         "extern const @frame @blank_frame;",
@@ -73,12 +83,24 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
 
 
 def constants(program: Program) -> list[str]:
-    """The parameters that the program was made from, and a frame to begin with."""
+    """The parameters that the program was made from, their ranges, and a frame to begin with."""
     frame = [blank_value(field) for field in program.fields("frame")]
     return [
         _constant(program, "parameters", "defaults", jax.tree.leaves(program.ik)),
         _constant(program, "frame", "blank_frame", frame),
+        _sliders(program),
     ]
+
+
+def _sliders(program: Program) -> str:
+    rows = []
+    for number, name, unit, meaning, *numbers in table(program):
+        words = ", ".join(json.dumps(word, ensure_ascii=False) for word in (name, unit, meaning))
+        rows.append(
+            f"    {{{number}, {words}, {', '.join(literal(np.float32(x)) for x in numbers)}}}"
+        )
+    listed = ",\n".join(rows)
+    return f"const @slider @sliders[@NAME_SLIDERS] = {{\n{listed}\n}};"
 
 
 def _constant(program: Program, struct: str, name: str, leaves: Sequence[ArrayLike]) -> str:

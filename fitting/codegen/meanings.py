@@ -7,13 +7,16 @@ import inspect
 import textwrap
 from collections.abc import Iterator
 from importlib import metadata
+from typing import NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import PyTree
 
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Rule
 
+from .graph import BOOL, FLOAT
 from .memory import words
 from .program import Program
 
@@ -64,6 +67,39 @@ def meanings(tree: PyTree) -> dict[tuple[str, ...], str]:
     if isinstance(tree, Rule):
         return {tuple(name.split(".")): text for name, text in _of_parameters(tree).items()}
     return dict(_of_fields(tree, ()))
+
+
+class Entry(NamedTuple):
+    """A parameter, for a panel of sliders."""
+
+    number: int
+    """Of its number among those of the struct."""
+    name: str
+    unit: str
+    meaning: str
+    value: float
+    """From which the program was made."""
+    low: float
+    high: float
+
+
+def table(program: Program) -> list[Entry]:
+    """All parameters that have a range, and switches from 0 to 1, in the order of their struct."""
+    ik = program.ik
+    declared, texts = parameter_tree.declarations(ik), parameter_tree.docs(ik)
+    entries, number = [], 0
+    for field, leaf in zip(program.fields("parameters"), jax.tree.leaves(ik), strict=True):
+        name, values = ".".join(field.path), np.asarray(leaf)
+        for index in np.ndindex(*field.shape):
+            each = name + "".join(f"[{i}]" for i in index)
+            if field.kind == FLOAT and name in declared:
+                unit, low, high = declared[name].unit, declared[name].low, declared[name].high
+                value = float(values[index])
+                entries.append(Entry(number, each, unit, texts[name], value, low, high))
+            elif field.kind == BOOL:
+                entries.append(Entry(number, each, "", texts[name], float(values[index]), 0.0, 1.0))
+            number += 1
+    return entries
 
 
 def _of_parameters(ik: Rule) -> dict[str, str]:

@@ -34,7 +34,7 @@ extern "C"
 #endif
 void @loop(
     const @parameters *parameters, const @rig *rig, const @frame *frame, const @hit *hits,
-    const @state *starts, int count, @state *states, @ray *rays, @result *result
+    const @state *starts, int count, int tracked, @state *states, @ray *rays, @result *result
 ) {
     @state memory, *state = &memory;
     @work space, *work = &space;
@@ -44,6 +44,7 @@ void @loop(
         if (starts) *state = starts[i];
 @POINTED
         states[i] = *state;
+        parameters += tracked;
     }
 }
 """
@@ -100,6 +101,8 @@ class Playback:
         frames: jaxik.Frame,
         hits: Hit,
         starts: jaxik.State | None = None,
+        *,
+        tracked: bool = False,
     ) -> None:
         """Prepares the frames.
 
@@ -109,6 +112,7 @@ class Playback:
             frames: (frames), with the fields of the program's.
             hits: (frames, rays), in the order of `jaxik.step`.
             starts: memory before each frame; None takes that after the frame before.
+            tracked: whether the parameters are (frames), since they change.
 
         Raises:
             ValueError: the frames have other fields than those of the program.
@@ -125,15 +129,17 @@ class Playback:
             for part in parts
             if part is not None
         ]
-        singles = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree) for tree in setup]
-        self._inputs = [rows(tree) for tree in (*singles, frames, flat)]
+        ik, rig = (jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree) for tree in setup)
+        ik = setup[0] if tracked else ik
+        self._inputs = [rows(tree) for tree in (ik, rig, frames, flat)]
         self._inputs += [] if starts is None else [rows(starts)]
         sizes = [len(program.places["state"]), RAY * program.ray_count]
         sizes.append(len(program.places["result"]))
         self._outputs = [np.zeros((count, size), np.uint32) for size in sizes]
         pointers = [x.ctypes.data_as(ctypes.c_void_p) for x in (*self._inputs, *self._outputs)]
         missing = [None] if starts is None else []
-        self._arguments = [*pointers[:-3], *missing, ctypes.c_int(count), *pointers[-3:]]
+        counts = ctypes.c_int(count), ctypes.c_int(tracked)
+        self._arguments = [*pointers[:-3], *missing, *counts, *pointers[-3:]]
         self._compiled = compiled
         self.program = program
 

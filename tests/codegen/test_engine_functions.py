@@ -14,6 +14,7 @@ import jaxik
 from fitting.bench import workloads
 from fitting.codegen import c_files, memory, program, toolchain
 from fitting.codegen.axes import ENGINES, conversions
+from jaxik.maths import parameter_tree
 
 # Of each engine: what its axes are in ours (x left, y up, z forward), and its unit in m.
 AXES = {
@@ -43,6 +44,11 @@ def system() -> program.Program:
     return program.build(ik, program.blank_rig(2), ground)
 
 
+@pytest.fixture(scope="module")
+def library(tmp_path_factory, system) -> ctypes.CDLL:
+    return compiled(tmp_path_factory.mktemp("walker"), system, None)
+
+
 def words_of(tree) -> np.ndarray:
     return np.frombuffer(memory.words(tree), np.uint32).copy()
 
@@ -61,8 +67,8 @@ def still(*shape: int) -> jaxik.Transform:
     return jaxik.Transform(np.zeros((*shape, 3), np.float32), rot)
 
 
-def test_legs_and_speeds_are_those_of_python(tmp_path, system):
-    random, library = np.random.default_rng(3), compiled(tmp_path, system, None)
+def test_legs_and_speeds_are_those_of_python(library):
+    random = np.random.default_rng(3)
     pose = jaxik.LegPose(*(random_transform(random, 2) for _ in range(4)))
     builder, frames = jaxik.FrameBuilder(), []
     moments = (-1, 0.02), (-1, 0.03), (0, 0.02), (0, 0.0)
@@ -88,8 +94,35 @@ def test_legs_and_speeds_are_those_of_python(tmp_path, system):
         before = frame
 
 
-def test_a_blank_frame_has_whole_weights_on_the_ground(tmp_path, system):
-    library = compiled(tmp_path, system, None)
+class Slider(ctypes.Structure):
+    _fields_ = [
+        ("number", ctypes.c_int),
+        *((name, ctypes.c_char_p) for name in ("name", "unit", "meaning")),
+        *((name, ctypes.c_float) for name in ("value", "low", "high")),
+    ]
+
+
+def test_sliders_say_what_each_parameter_is(library, system):
+    declared = parameter_tree.declarations(system.ik)
+    count = len(declared) + sum(
+        slot.value.dtype == bool for slot in parameter_tree.slots(system.ik)
+    )
+    sliders = (Slider * count).in_dll(library, "walker_sliders")
+    places = system.places["parameters"]
+    defaults = (ctypes.c_float * len(places)).in_dll(library, "walker_defaults")
+    for slider in sliders:
+        name = slider.name.decode()
+        assert name == ".".join(places[slider.number].field.path)
+        if (declaration := declared.get(name)) is None:
+            assert (slider.low, slider.high, slider.value in (0, 1)) == (0, 1, True)
+        else:
+            assert (slider.low, slider.high) == pytest.approx((declaration.low, declaration.high))
+            assert slider.value == defaults[slider.number]
+            assert slider.unit.decode() == declaration.unit
+        assert slider.meaning.decode() == parameter_tree.docs(system.ik)[name]
+
+
+def test_a_blank_frame_has_whole_weights_on_the_ground(library, system):
     words = np.ctypeslib.as_array(
         (ctypes.c_uint32 * len(system.places["frame"])).in_dll(library, "walker_blank_frame")
     )

@@ -18,6 +18,7 @@ from fitting.bench import workloads
 from fitting.codegen import export
 from fitting.codegen.toolchain import Compiled, Outputs, Playback
 from fitting.runtime.precision import with_floats
+from jaxik.maths import parameter_tree
 from jaxik.pipeline import step_and_rays
 from jaxik.world import terrain
 from jaxik.world.skeleton import Transform
@@ -152,9 +153,14 @@ def differences(ours: Any, theirs: Any) -> np.ndarray:
     return np.max(largest, axis=0)
 
 
+def first_of(frames: jaxik.Frame) -> jaxik.Frame:
+    return jax.tree.map(lambda leaf: leaf[0], frames)
+
+
 def played(case: Case, folder: Any, command: tuple[str, ...], *, chained: bool) -> Outputs:
-    frame = jax.tree.map(lambda leaf: leaf[0], case.frames)
-    program = export.export_c(case.ik, case.rig, folder, terrain=case.ground, frame=frame)
+    program = export.export_c(
+        case.ik, case.rig, folder, terrain=case.ground, frame=first_of(case.frames)
+    )
     compiled = Compiled(program, folder, "footik", command)
     starts = None if chained else case.starts
     play = Playback(compiled, (case.ik, case.rig), case.frames, case.hits, starts)
@@ -213,6 +219,38 @@ def make_case_on_platform(name: str, ground: Any) -> Case:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{__name__}.frames_of", lambda *_: jax.tree.map(np.asarray, frames))
         return make_case(name, 2, count, 0, ground)
+
+
+@pytest.mark.parametrize("name", ["record", "stride", "mec"])
+def test_parameters_that_change_along_a_clip_are_those_of_jax(name, tmp_path):
+    case, rng = make_case(name, 2, 300), np.random.default_rng(7)
+    names = {"record": "limit", "stride": "highest_share", "mec": "max_length"}
+    track = f"pelvis.{names[name]}"
+    values = jnp.asarray(rng.uniform(0.1, 0.9, 300), jnp.float32)
+    tracked = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (300, *leaf.shape)), case.ik)
+    tracked = parameter_tree.replace(tracked, {track: values})
+
+    @jax.jit
+    def recorded_along(rig: jaxik.Rig, ground: Any) -> tuple:
+        def advance(state: jaxik.State, now: tuple) -> tuple:
+            state, result, _, hits = step_and_rays(now[0], rig, ground, state, now[1])
+            return state, (result, hits)
+
+        return jax.lax.scan(advance, jaxik.init(case.ik, rig), (tracked, case.frames))[1]
+
+    with jax.enable_x64(False):
+        results, hits = jax.device_get(recorded_along(case.rig, case.ground))
+        run = jaxik.run(case.ik, case.rig, case.ground, case.frames, tracks={track: values})
+    assert differences(results, case.results).max() > 0.01
+    run = dataclasses.replace(jax.device_get(run), trace=None)
+    assert np.median(differences(run, results)) < CLOSE
+    program = export.export_c(
+        case.ik, case.rig, tmp_path, terrain=case.ground, frame=first_of(case.frames)
+    )
+    compiled = Compiled(program, tmp_path, "footik", BUILDS["gcc"])
+    play = Playback(compiled, (tracked, case.rig), case.frames, hits, tracked=True)
+    play()
+    assert np.mean(differences(play.outputs().results, results) > CLOSE) < PARTED
 
 
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
