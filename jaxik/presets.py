@@ -118,7 +118,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         faithful: put the root on the ground at once, as the sample does: nothing has memory then.
     """
     ik = FootIK(
-        root=GroundRoot(half_life=0.0) if faithful else GroundRoot(),
+        root=GroundRoot(half_life=0.0, cross_gaps=False) if faithful else GroundRoot(),
         warp=StrideWarp(),
         probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False, limited=not faithful),
         contact=StandingContact(),
@@ -151,7 +151,7 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             for motion, as the original does.
     """
     ik = FootIK(
-        root=GroundRoot(enabled=not faithful),
+        root=GroundRoot(enabled=not faithful, cross_gaps=not faithful),
         warp=StrideWarp(),
         probe=RootProbe(limited=not faithful),
         contact=StandingContact(idle_speed=0.0 if faithful else 0.1),
@@ -184,7 +184,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             game to keep the character on the ground. If not, knees bend as animated.
     """
     ik = FootIK(
-        root=GroundRoot(enabled=not faithful),
+        root=GroundRoot(enabled=not faithful, cross_gaps=not faithful),
         warp=StrideWarp(),
         probe=CornerProbe(limited=False),
         contact=StandingContact(),

@@ -99,7 +99,7 @@ def test_hits_of_rays_replay_a_frame_as_it_is_on_the_terrain():
         return [*ways, (after, result)], rays, hits
 
     (expected, *others), rays, hits = three_ways(ik, still)
-    assert rays.origins_ws.shape == (14, 3) and np.all(hits.found == 1.0)
+    assert rays.origins_ws.shape == (6, 3) and np.all(hits.found == 1.0)
     for motion in others:
         assert_close(motion, expected, EXACT)
     corrections = expected[1].corrections.knee

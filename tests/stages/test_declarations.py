@@ -110,14 +110,14 @@ ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no;
   NoLock; NoSeparation; LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes;
   PoleLeg;
   AimFoot; SpeedFade
-ozz!: StandingContact; GroundRoot half_life=0; StrideWarp;
+ozz!: StandingContact; GroundRoot half_life=0 cross_gaps=no; StrideWarp;
   FootProbe limited=no ray_down=inf use_toe=no; SoleTarget; NoLean; NoLock; NoSeparation;
   LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes; PoleLeg; AimFoot;
   NoFade
 unreal: StandingContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean;
   NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade
-unreal!: StandingContact idle_speed=0; GroundRoot enabled=no; StrideWarp; RootProbe limited=no;
+unreal!: StandingContact idle_speed=0; GroundRoot enabled=no cross_gaps=no; StrideWarp; RootProbe limited=no;
   RootTarget; NoLean; NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade
 mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; GroundRoot; StrideWarp;
@@ -125,7 +125,7 @@ mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; Grou
   SoleTarget max_slope=0 foot_height=0.085; NoLean;
   PlantLock release_distance=0.15 release_angle=0.5; FootSeparation;
   LegLengthPelvis max_length=0.84; FadeEffector; PoleLeg allow_stretch=yes; FlatFoot; SpeedFade
-mec!: StandingContact; GroundRoot enabled=no; StrideWarp; CornerProbe limited=no;
+mec!: StandingContact; GroundRoot enabled=no cross_gaps=no; StrideWarp; CornerProbe limited=no;
   SoleTarget max_slope=0 foot_height=0.1; NoLean; PlantLock; NoSeparation; LegLengthPelvis;
   FadeEffector; PoleLeg to_hint=yes allow_stretch=yes; FlatFoot; NoFade
 stride: LabelContact; KeepRoot; StrideWarp;
@@ -147,7 +147,7 @@ DirectEffector.if_found=no
 FadeEffector.by_contact=no FlatFoot.bend_toes=no FootProbe.check_support=no
 FootProbe.simple_in_flight=no
 FootProbe.limited=yes FootProbe.use_toe=yes
-GroundRoot.enabled=yes HeelEffector.by_contact=no
+GroundRoot.cross_gaps=yes GroundRoot.enabled=yes HeelEffector.by_contact=no
 LegLengthPelvis.damp=yes LegLengthPelvis.enabled=yes LowestPelvis.enabled=yes
 LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=yes
 OffsetLock.hold_ball=no PlantLock.plant=yes KeepFoot.bend_toes=no
