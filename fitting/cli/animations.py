@@ -10,6 +10,7 @@ from . import status
 from .options import (
     ADDRESS,
     CLIP_OPTIONS,
+    CLIPS,
     TERRAIN_OPTIONS,
     Option,
     argument,
@@ -49,8 +50,7 @@ def _animation_and_terrain(*, required: bool = True) -> tuple[Option, ...]:
     """A flat animation, its terrain, and how they lie."""
     clip = argument(
         "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
-        help=".bvh, .amc, .glb, .gltf, .c3d or .npz over flat ground (an .npz may also hold the "
-        "captured motion)",
+        help=f"{CLIPS} over flat ground (an .npz may also hold the captured motion)",
     )  # fmt: skip
     return clip, *_terrain(required=required)
 

@@ -13,6 +13,7 @@ from .options import (
     CLIP_GROUP,
     CLIP_OPTIONS,
     CLIP_UNITS,
+    CLIPS,
     Command,
     argument,
     clip_options,
@@ -36,7 +37,7 @@ TEMPLATE = Path()
 
 
 @command(
-    argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf, .c3d or .npz"),
+    argument("clip", type=Path, metavar="CLIP", help=CLIPS),
     flag("--json", "as JSON"),
     group(
         CLIP_GROUP,
@@ -79,7 +80,7 @@ def inspect(options: argparse.Namespace) -> int:
 
 @command(
     argument(
-        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf, .c3d or .npz",
+        "clip", type=Path, metavar="CLIP", help=f"captured: {CLIPS}",
     ),
     output("MESH", ".ply, .obj or .stl"),
     argument(

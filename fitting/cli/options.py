@@ -142,6 +142,7 @@ def _read(
 rate = number(1, 1000, "Hz")
 
 CLIP_GROUP = "how the clip is read (default: recognised or guessed)"
+CLIPS = ".bvh, .amc, .glb, .gltf, .c3d, .trc, .csv, .npy or .npz"
 CLIP_UNITS = (
     argument(
         "--scale", type=number(1e-9, 1e6), metavar="M", help="metres per unit of the clip's file"

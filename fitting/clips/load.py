@@ -14,9 +14,9 @@ from . import edit, formats
 from .assemble import clip_from_recording
 from .clip import Clip, Recording
 from .formats.asfamc import read_asfamc
-from .formats.c3d import draft_marker_map, joint_name, read_c3d
 from .formats.gltf import SUFFIXES as GLTF
 from .formats.gltf import read_gltf
+from .formats.markers import draft_marker_map, is_marked, joint_name, read_marked
 from .formats.npz import read_npz
 from .joint_maps import read_joint_map, template
 from .skating import TRAVELS, Travel
@@ -60,7 +60,7 @@ class ClipOptions:
     def of_file(self, path: Path) -> "ClipOptions":
         """Those that a file of this format takes, where several files share the options."""
         suffix = path.suffix.lower()
-        if suffix == ".npz":
+        if _is_saved_clip(path):
             return ClipOptions(sole=self.sole)
         other = [("asf", {".amc"}), ("animation", GLTF)]
         taken = {name: None for name, suffixes in other if suffix not in suffixes}
@@ -103,7 +103,11 @@ def load_clip(
     travel: str | None = None,
     sole: float | None = None,
 ) -> Clip:
-    """Reads a BVH, AMC (with its ASF), glTF, GLB, C3D or NPZ file as a clip in metres with y up.
+    """Reads a motion file as a clip in metres with y up.
+
+    Those of joints with rotations are BVH, AMC (with its ASF), glTF and GLB, those of places alone
+    C3D, TRC, CSV and NPY; an NPZ is a saved clip, or has an array `positions` (frames, joints, 3),
+    at best with `names` and `fps`.
 
     Args:
         path: the file; its suffix selects the format.
@@ -114,8 +118,8 @@ def load_clip(
             animation is sampled at this rate, and any other plays as fast as it says.
         up: "y" or "z"; None takes the axis along which the pelvis is above the feet.
         joints: role to joint name, see `joint_maps.find_roles`, or a joint map, see
-            `clips.joint_maps`; None recognises the names. Of a C3D file it names markers, see
-            `clips.formats.c3d.read_c3d`.
+            `clips.joint_maps`; None recognises the names. Of a C3D, TRC, CSV or NPY file it names
+            markers, see `clips.formats.markers.read_marked`.
         animation: which animation of a glTF file; None takes the only one.
         travel: "stances" moves the root so that standing feet stay where they stand, "none" leaves
             it, and "auto", or None, moves it in a cycle that is clearly in place.
@@ -132,7 +136,6 @@ def load_clip(
             names in `joints` that the file lacks.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
     _check_arguments(path, asf, animation)
     if isinstance(joints, str | Path):
         joints = read_joint_map(Path(joints))
@@ -144,18 +147,23 @@ def load_clip(
         "joints": joints,
         "travel": travel,
     }
-    if suffix == ".npz":
+    if _is_saved_clip(path):
         arguments = {**stated, "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
         return edit.on_floor(read_npz(path), 0.0, sole)
-    if suffix == ".c3d":
-        recording = read_c3d(path, joints, scale)
+    if is_marked(path):
+        recording = read_marked(path, joints, scale)
         if joints is not None:  # which named markers
             stated["joints"] = {role: joint_name(role) for role in joints}
     else:
         recording = _read(path, asf, animation, fps)
     return edit.on_floor(clip_from_recording(recording, path.name, **stated), 0.0, sole)
+
+
+def _is_saved_clip(path: Path) -> bool:
+    """Whether a file is an archive that states all of a clip."""
+    return path.suffix.lower() == ".npz" and not is_marked(path)
 
 
 def _check_values(
@@ -203,9 +211,9 @@ def draft_joint_map(path: Path, options: ClipOptions) -> str:
     Raises:
         ValueError: as of `load_clip`, or the file is an NPZ, which takes no map.
     """
-    if path.suffix.lower() == ".npz":
+    if _is_saved_clip(path):
         raise ValueError(f"{path}: an .npz states which joint is which, and takes no joint map")
-    if path.suffix.lower() == ".c3d":
+    if is_marked(path):
         check_file(path)
         return draft_marker_map(path)
     _check_arguments(path, options.asf, options.animation)

@@ -473,14 +473,7 @@ def _read_archive(path: Path, scale: float) -> HeightfieldArrays:
 
 
 def _read_array(path: Path) -> np.ndarray:
-    try:
-        npz.check_array_file(path)
-        with path.open("rb") as file:
-            heights = np.load(file, allow_pickle=False)
-    except Exception as error:  # NumPy raises its own
-        what = in_one_line(error, QUOTED)
-        raise ValueError(f"{path}: wanted a NumPy array ({what})") from None
-    return _as_numbers(path, "the array", heights)
+    return _as_numbers(path, "the array", npz.read_array(path))
 
 
 def _as_numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from fitting.cli import main
 from fitting.clips import load_clip
-from fitting.clips.formats.c3d import chord, guess_map, hip_centres
 from fitting.clips.formats.c3d_file import read_markers
+from fitting.clips.formats.markers import chord, guess_map, hip_centres
 from fitting.clips.summary import as_text, describe
 from support.c3d_files import DEC, INTEL, MEASURES, MIPS, plug_in_gait, write_bytes, write_c3d
 from support.experiments import ROOT

@@ -158,6 +158,29 @@ def capture_bytes() -> bytes:
         return write_c3d(path, places, measures=MEASURES, channels=2).read_bytes()
 
 
+def points_as(kind: str) -> bytes:
+    """The places of joints, as an array of as many as SMPL has, or as an archive with names."""
+    clip, file = stair_walk().select(slice(0, 12)), io.BytesIO()
+    if kind == "npz":
+        arrays = {"positions": clip.positions_ws, "names": np.array(clip.joint_names)}
+        return archive_of(arrays | {"fps": np.array(30.0)})
+    np.save(file, np.resize(clip.positions_ws, (12, 22, 3)))
+    return file.getvalue()
+
+
+def trc_bytes() -> bytes:
+    """The places of joints as markers, of which one is not seen in a frame."""
+    clip = stair_walk().select(slice(0, 12))
+    names = clip.joint_names
+    lines = ["PathFileType\t4\t(X/Y/Z)\twalk.trc", "DataRate\tUnits", "30\tm"]
+    lines += ["Frame#\tTime\t" + "\t\t\t".join(names), ""]
+    for number, row in enumerate(clip.positions_ws.reshape(12, -1)):
+        cells = [f"{value:.4f}" for value in row]
+        cells[:3] = [""] * 3 if number == 4 else cells[:3]
+        lines.append("\t".join([str(number), f"{number / 30:.3f}", *cells]))
+    return "\n".join([*lines, ""]).encode()
+
+
 def blocks_archive() -> bytes:
     """Joint positions of a character that stands."""
     frames, upright = 12, [1.0, 0.0, 0.0, 0.0]
@@ -255,6 +278,10 @@ FORMATS: dict[str, Format] = {
     "clip, GLB": clip_format("walk.glb", lambda: clip_bytes(".glb"), damage=damage_glb),
     "clip, glTF": clip_format("walk.gltf", lambda: walker().text().encode(), damage=damage_json),
     "clip, C3D": clip_format("walk.c3d", capture_bytes, damage=damage_bytes),
+    "clip, CSV": clip_format("walk.csv", lambda: clip_bytes(".csv")),
+    "clip, TRC": clip_format("walk.trc", trc_bytes),
+    "clip, NPY": clip_format("walk.npy", partial(points_as, "npy"), damage=damage_bytes),
+    "clip, points": clip_format("points.npz", partial(points_as, "npz"), damage=damage_arrays),
     "clip, NPZ": clip_format("walk.npz", lambda: clip_bytes(".npz"), damage=damage_arrays),
     "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
     "heightfield": Format("hill.npz", heightfield_archive, load_ground, damage_arrays),

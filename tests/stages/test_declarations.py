@@ -117,9 +117,9 @@ ozz!: StandingContact; GroundRoot half_life=0 cross_gaps=no; StrideWarp;
 unreal: StandingContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean;
   NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade
-unreal!: StandingContact idle_speed=0; GroundRoot enabled=no cross_gaps=no; StrideWarp; RootProbe limited=no;
-  RootTarget; NoLean; NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
-  TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade
+unreal!: StandingContact idle_speed=0; GroundRoot enabled=no cross_gaps=no; StrideWarp;
+  RootProbe limited=no; RootTarget; NoLean; NoLock; NoSeparation; CapsulePelvis;
+  BodyEffector latch=yes; TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; NoFade
 mec: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35; GroundRoot; StrideWarp;
   CornerProbe by_speed=yes extra_min=-0.03 stable_height=0.095 stable_speed=0.25;
   SoleTarget max_slope=0 foot_height=0.085; NoLean;

@@ -21,13 +21,14 @@ from fitting.clips.clip import Recording
 
 from .asfamc import read_asfamc
 from .bvh import read_bvh
-from .c3d import read_c3d
 from .gltf import read_gltf
+from .markers import READERS as OF_POINTS
+from .markers import read_marked
 
 READERS: Mapping[str, Callable[[Path], Recording]] = {
     ".bvh": read_bvh,
     ".amc": read_asfamc,
     ".glb": read_gltf,
     ".gltf": read_gltf,
-    ".c3d": read_c3d,
+    **dict.fromkeys(OF_POINTS, read_marked),
 }

@@ -394,10 +394,20 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
 
 
-def check_array_file(path: Path) -> None:
-    """ValueError for an `.npy` that is not a plain array, or claims to be longer than it is."""
-    with path.open("rb") as file:
-        _check_header(file, path.name, path.stat().st_size)
+def read_array(path: Path) -> np.ndarray:
+    """The array in an `.npy`. Nothing is unpickled.
+
+    Raises:
+        ValueError: it is not a plain array, or claims to be longer than it is.
+    """
+    try:
+        with path.open("rb") as file:
+            _check_header(file, path.name, path.stat().st_size)
+            file.seek(0)
+            return np.load(file, allow_pickle=False)
+    except Exception as error:  # NumPy raises its own
+        what = in_one_line(error, QUOTED)
+        raise ValueError(f"{path}: wanted a NumPy array ({what})") from None
 
 
 def _with_common_floats(array: np.ndarray) -> np.ndarray:

@@ -29,8 +29,11 @@ from fitting.clips.joint_maps import LEG_NAMES, LEG_ROLES, Leg, find_roles
 from fitting.clips.rigs import Vectors, leg_rotations, reject, rotation, unit
 from fitting.runtime.validation import error_context
 
+from . import points_file
 from .c3d_file import AXES, UNITS, Markers, listed, read_markers
 
+READERS = {".c3d": read_markers} | points_file.READERS
+"""Of places without rotations, by the suffix; archives are recognised by their arrays."""
 MM = 1e-3  # m
 MARKER_RADIUS = 7.0 * MM  # m, of the usual marker of 14 mm
 KNEE_WIDTH, ANKLE_WIDTH = 0.11, 0.08  # of a leg's length; where none was measured
@@ -61,6 +64,10 @@ UNEVEN = 0.1  # of a bone's length, by which it changes in a capture that is in 
 UNRECOGNISED = (
     "no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, LPSI and RPSI or "
     "SACR, and of each leg THI, KNE, TIB, ANK, TOE, at best HEE)"
+)
+FROM_PLACES = (
+    "rotations follow from the places of joints: how feet roll is a guess, as the hinges of their "
+    "knees do"
 )
 UPRIGHT = 0.5  # of the way from the ankles to the pelvis, at least, goes up
 
@@ -351,7 +358,8 @@ def from_map(markers: Markers, joints: Mapping[str, str]) -> MarkerJoints:
     pelvis = [positions[:, index] for index in members["pelvis"]]
     if len(pelvis) > 3:
         pelvis = [*pelvis[:2], np.mean(pelvis[2:], axis=0)]
-    return MarkerJoints(_skeleton(places, pelvis if len(pelvis) == 3 else [], {}), known, used)
+    skeleton = _skeleton(places, pelvis if len(pelvis) == 3 else [], {})
+    return MarkerJoints(skeleton, known, used, remarks=(FROM_PLACES,))
 
 
 def _members(markers: Markers, role: str, text: str) -> list[int]:
@@ -468,10 +476,10 @@ def guess_map(names: tuple[str, ...]) -> dict[str, str]:
     return roles
 
 
-def read_c3d(
+def read_marked(
     path: Path, joints: Mapping[str, str] | None = None, scale: float | None = None
 ) -> Recording:
-    """The joints of a C3D file, in its own unit, from its markers.
+    """The joints of a file of markers or of joints' places, in its own unit.
 
     Frames in which a marker that is needed was not seen are masked: joints move there on straight
     lines between the frames before and after. Without a map, the joints are those of Plug-in Gait,
@@ -484,11 +492,11 @@ def read_c3d(
         scale: metres per unit; None takes the unit that the file states.
 
     Raises:
-        ValueError: with the file's name: it is not a whole C3D file of markers, lacks those that
+        ValueError: with the file's name: it is not what its suffix says, lacks the markers that
             are named, or no frame has them all.
     """
     with error_context(path):
-        markers = _turned(read_markers(path))
+        markers = _turned(_read(path))
         if joints is not None:
             checked = joint_maps.check_joint_map(dict(joints), "the joint map")
             return _recording(markers, from_map(markers, checked))
@@ -497,6 +505,15 @@ def read_c3d(
         if (known := _as_joints(markers.names)) is not None:
             return _recording(markers, from_map(markers, known))
         return _bare(markers)
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file holds places without rotations."""
+    return path.suffix.lower() in READERS or points_file.holds_points(path)
+
+
+def _read(path: Path) -> Markers:
+    return READERS.get(path.suffix.lower(), points_file.read_archive)(path)
 
 
 def _subject_of(markers: Markers) -> Subject | None:
@@ -509,10 +526,10 @@ def draft_marker_map(path: Path) -> str:
     """A joint map of a file's markers, to be edited: the best guess, and all names.
 
     Raises:
-        ValueError: with the file's name, as of `read_c3d`.
+        ValueError: with the file's name, as of `read_marked`.
     """
     with error_context(path):
-        names = read_markers(path).names
+        names = _read(path).names
         known = _as_joints(names)
     roles = guess_map(names) if known is None else known
     return joint_maps.marker_template(names, roles, path.name)
