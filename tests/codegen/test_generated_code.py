@@ -17,7 +17,7 @@ from jaxtyping import Array
 import jaxik
 from fitting.bench import workloads
 from fitting.clips.clip_frames import frames_from_clip
-from fitting.codegen import c_code, c_files, export, program, stablehlo, toolchain
+from fitting.codegen import c_code, c_files, export, header, program, stablehlo, toolchain
 from fitting.codegen.graph import DTYPES, Graph
 from fitting.codegen.toolchain import Compiled, Playback
 from jaxik.maths import parameter_tree, smoothing, vec
@@ -268,6 +268,14 @@ def operations(operands, walk) -> program.Program:
         )
 
 
+@pytest.fixture
+def no_routines(monkeypatch):
+    """As of frames that are rows of operands."""
+    for module in (c_code, header):
+        monkeypatch.setattr(module, "routines", lambda program: [])
+
+
+@pytest.mark.usefixtures("no_routines")
 def test_every_operation_gives_the_answers_of_jax(tmp_path, walk, operands, operations):
     rows, expected = operands
     for file, text in c_files.sources(operations, "rules").items():
