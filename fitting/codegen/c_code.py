@@ -5,7 +5,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .functions import LETTERS, Language, body_of, helpers_in, parts_of, routine_of
+from .functions import (
+    LETTERS,
+    Language,
+    body_of,
+    helpers_in,
+    inputs_of,
+    parts_of,
+    phase_name,
+    routine_of,
+)
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .program import Place, Program
 from .routines import PLATFORM, Routine, routines
@@ -259,17 +268,10 @@ def functions(program: Program, schedule: Schedule) -> list[str]:
 
 def signature(phase: int, rounds: int) -> str:
     """The head of the function of a phase."""
-    inputs = [ARGUMENTS[name] for name in ("parameters", "rig")]
-    if phase == 0:
-        return f"void @init({', '.join([*inputs, '@state *state'])})"
-    inputs += [ARGUMENTS["state"], ARGUMENTS["frame"]]
-    hits = [ARGUMENTS["hits"]] if phase > 1 else []
-    if phase <= rounds:
-        more = [*inputs, *hits, ARGUMENTS["work"], ARGUMENTS["rays"]]
-        return f"void @rays_{phase}({', '.join(more)})"
-    inputs[2] = "@state *state"
-    more = [*inputs, *hits, ARGUMENTS["work"], ARGUMENTS["result"]]
-    return f"void @step({', '.join(more)})"
+    heads = {name: ARGUMENTS[name] for name in inputs_of(phase, rounds)}
+    if phase in (0, rounds + 1):
+        heads["state"] = "@state *state"
+    return f"void @{phase_name(phase, rounds)}({', '.join(heads.values())})"
 
 
 def routine_head(routine: Routine) -> str:

@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from string import ascii_lowercase
 from typing import NamedTuple
 
@@ -95,6 +95,39 @@ def parts_of(program: Program, schedule: Schedule, language: Language) -> Parts:
 def helpers_in(language: Language, text: str) -> list[str]:
     """The helpers that this code calls."""
     return [body for name, body in language.helpers.items() if f"@{name}(" in text]
+
+
+def phase_name(phase: int, rounds: int) -> str:
+    """The name of the function of a phase."""
+    return "init" if phase == 0 else "step" if phase > rounds else f"rays_{phase}"
+
+
+def inputs_of(phase: int, rounds: int) -> list[str]:
+    """The names of what the function of a phase is given, and of what it hands out."""
+    if phase == 0:
+        return ["parameters", "rig", "state"]
+    hits = ["hits"] if phase > 1 else []
+    handed = "rays" if phase <= rounds else "result"
+    return ["parameters", "rig", "state", "frame", *hits, "work", handed]
+
+
+def calls_of(
+    program: Program, call: Callable[[int, int], str], *, casts: bool = False
+) -> Iterator[str]:
+    """The lines of a frame.
+
+    Args:
+        program: what is called.
+        call: of a phase, with the number of rounds.
+        casts: whether a call `cast(first, end)` follows the rays of each round.
+    """
+    rounds, first = len(program.rounds), 0
+    for phase, rays in enumerate(program.rounds, 1):
+        yield call(phase, rounds)
+        if casts:
+            yield f"cast({first}, {first + len(rays)});"
+        first += len(rays)
+    yield call(rounds + 1, rounds)
 
 
 def fill(template: str, fillings: Mapping[str, str]) -> str:

@@ -1,36 +1,32 @@
 """The header of a program in C: structs with units and meanings, and the parameters' values."""
 
 import json
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterator, Mapping
 
-import jax
 import numpy as np
-from jax.typing import DTypeLike
-from jaxtyping import ArrayLike, PyTree
 
-from .axes import ENGINES, conversions
+from .axes import conversions
 from .c_code import C_TYPES, literal, routine_head, signature
-from .functions import LETTERS
+from .functions import LETTERS, calls_of, inputs_of, phase_name
 from .graph import Number
-from .meanings import AXES, STRUCTS, meanings, origin, table
-from .program import Field, Program, blank_value
+from .meanings import (
+    AXES,
+    BLANK_FRAME,
+    RAYS,
+    STRUCTS,
+    comment,
+    engine_axes,
+    meanings,
+    origin,
+    ray_fields,
+    table,
+    use,
+)
+from .program import Field, Members, Program, constants_of, members_of
 from .routines import routines
 from .schedule import Schedule
 
-COLUMNS = 96
-USE = """\
-Use: @init makes the state of a character. In each frame call, in this order,
-
-{calls}
-
-Each of these but the last adds rays behind those that are there. Cast them before the next call:
-from their origins along their directions, as far as their lengths, onto the layers of their masks.
-Of what rays[i] hits, write point and normal to hits[i], and 1 to its found, or 0 if it hits
-nothing{platforms}. Rays, hits and work need not be kept from one frame to the next. Nothing is
-allocated, and there is no other memory: characters may be computed in parallel. Do not compile
-with -ffast-math."""
+FAST_MATH = " Do not compile with -ffast-math."
 
 
 def text(program: Program, schedule: Schedule, engine: str | None) -> str:
@@ -41,7 +37,7 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
     counts |= {f"RAYS_{i}": len(rays) for i, rays in enumerate(program.rounds, 1)}
     functions = [f"{signature(phase, rounds)};" for phase in range(rounds + 2)]
     lines = [
-        *_comment(_head(program)),
+        *comment(_head(program)),
         f"#ifndef {guard}",
         f"#define {guard}",
         "",
@@ -49,13 +45,13 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
         "",
         '#ifdef __cplusplus\nextern "C" {\n#endif',
         "",
-        *_rays(program),
+        *(line for struct in RAYS for line in _ray(program, struct)),
         *(line for struct in STRUCTS for line in _struct(program, struct)),
-        *_comment(["What a frame keeps between its functions."]),
+        *comment(["What a frame keeps between its functions."]),
         *_work(schedule),
         "extern const @parameters @defaults;",
         "",
-        *_comment(["A parameter, for a panel of sliders: the number of those in @parameters."]),
+        *comment(["A parameter, for a panel of sliders: the number of those in @parameters."]),
         "typedef struct @slider {",
         "    int number; /* each takes four bytes */",
         "    const char *name, *unit, *meaning;",
@@ -63,7 +59,7 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
         "} @slider;",
         "extern const @slider @sliders[@NAME_SLIDERS];",
         "",
-        *_comment(["A frame to begin with: full foot IK, on the ground, footholds unknown."]),
+        *comment([BLANK_FRAME]),
         "extern const @frame @blank_frame;",
         "",
         *functions,
@@ -71,7 +67,7 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
         *(
             line
             for routine in routines(program)
-            for line in (*_comment([routine.meaning]), f"{routine_head(routine)};", "")
+            for line in (*comment([routine.meaning]), f"{routine_head(routine)};", "")
         ),
         *(_axes(engine) if engine else ()),
         "#ifdef __cplusplus\n}\n#endif",
@@ -82,14 +78,12 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
     return "\n".join(lines)
 
 
-def constants(program: Program) -> list[str]:
-    """The parameters that the program was made from, their ranges, and a frame to begin with."""
-    frame = [blank_value(field) for field in program.fields("frame")]
-    return [
-        _constant(program, "parameters", "defaults", jax.tree.leaves(program.ik)),
-        _constant(program, "frame", "blank_frame", frame),
-        _sliders(program),
-    ]
+def constants(program: Program) -> Iterator[str]:
+    """The parameters that the program was made from, a frame to begin with, and sliders."""
+    for name, (struct, values) in constants_of(program).items():
+        body = _initialiser(members_of(list(values)), values, 0)
+        yield f"const @{struct} @{name} = {body};"
+    yield _sliders(program)
 
 
 def _sliders(program: Program) -> str:
@@ -103,30 +97,14 @@ def _sliders(program: Program) -> str:
     return f"const @slider @sliders[@NAME_SLIDERS] = {{\n{listed}\n}};"
 
 
-def _constant(program: Program, struct: str, name: str, leaves: Sequence[ArrayLike]) -> str:
-    pairs = zip(program.fields(struct), leaves, strict=True)
-    filled = [(field, np.asarray(leaf, _dtype(leaf))) for field, leaf in pairs if field.size]
-    body = _initialiser([field for field, _ in filled], (value for _, value in filled), 0)
-    return f"const @{struct} @{name} = {body};"
-
-
-def _dtype(leaf: ArrayLike) -> DTypeLike:
-    dtype = np.asarray(leaf).dtype
-    return np.float32 if np.issubdtype(dtype, np.floating) else dtype
-
-
 def _head(program: Program) -> list[str]:
-    moving = ", and to its platform the number of what moves, or -1" if program.platforms else ""
-    use = USE.format(calls="\n".join(calls(program, "    ")), platforms=moving)
-    return [*origin(program), *use.split("\n\n"), AXES]
+    *paragraphs, last = use(program, calls(program, "    "))
+    return [*origin(program), *paragraphs, last + FAST_MATH, AXES]
 
 
 def _axes(engine: str) -> Iterator[str]:
     """Conversions from the axes of an engine and back, as functions of a header."""
-    yield from _comment([
-        f"{engine.capitalize()}: {ENGINES[engine].meaning}; quaternions are x y z w. Model space "
-        "and world space are converted alike, and rotations of joints."
-    ])  # fmt: skip
+    yield from comment([engine_axes(engine, "; quaternions are x y z w")])
     for name, source, parts in conversions(engine):
         arguments = f"const float {source}[{len(parts)}], float to[{len(parts)}]"
         yield f"static inline void @{name}({arguments}) {{"
@@ -144,85 +122,50 @@ def calls(program: Program, indent: str, prefix: str = "&", *, casts: bool = Fal
     Where it `casts`, a call `cast(first, end)` follows the rays of each round.
     """
 
-    def arguments(phase: int) -> str:
-        structs = ", ".join(f"{prefix}{name}" for name in ("parameters", "rig", "state", "frame"))
-        return f"{structs}, {'hits, ' if phase > 1 else ''}{prefix}work"
+    def call(phase: int, rounds: int) -> str:
+        names = inputs_of(phase, rounds)
+        passed = (name if name in ("hits", "rays") else prefix + name for name in names)
+        return f"@{phase_name(phase, rounds)}({', '.join(passed)});"
 
-    lines, first = [], 0
-    for phase, rays in enumerate(program.rounds, 1):
-        lines.append(f"@rays_{phase}({arguments(phase)}, rays);")
-        lines += [f"cast({first}, {first + len(rays)});"] if casts else []
-        first += len(rays)
-    lines.append(f"@step({arguments(len(program.rounds) + 1)}, {prefix}result);")
-    return [f"{indent}{line}" for line in lines]
+    return [indent + line for line in calls_of(program, call, casts=casts)]
 
 
-def _comment(paragraphs: Sequence[str], indent: str = "") -> list[str]:
-    """A comment of these paragraphs; those that are indented stay as they are."""
-    filled = [
-        line
-        for paragraph in paragraphs
-        for line in (
-            [*paragraph.split("\n"), ""]
-            if paragraph.startswith(" ")
-            else [*textwrap.wrap(paragraph.replace("*/", "* /"), COLUMNS - len(indent)), ""]
-        )
-    ][:-1]
-    start, rest = f"{indent}/* ", f"{indent}   "
-    lines = [f"{rest if i else start}{line}".rstrip() for i, line in enumerate(filled)]
-    lines[-1] += " */"
-    return lines
-
-
-def _rays(program: Program) -> list[str]:
-    platform = ["    int platform;"] if program.platforms else []
-    return [
-        *_comment(["A ray that the engine is to cast, world space."]),
-        "typedef struct @ray {",
-        "    float origin[3]; /* m */",
-        "    float direction[3]; /* unit */",
-        "    float length; /* m */",
-        "    unsigned layers; /* those that it can hit, one bit each */",
-        "} @ray;",
-        "",
-        *_comment(["What a ray hits, world space."]),
-        "typedef struct @hit {",
-        "    float point[3]; /* m */",
-        "    float normal[3]; /* unit */",
-        "    float found; /* 1, or 0 of a miss, of which nothing else counts */",
-        *platform,
-        "} @hit;",
-        "",
-    ]
+def _ray(program: Program, struct: str) -> Iterator[str]:
+    yield from comment([RAYS[struct]])
+    yield f"typedef struct @{struct} {{"
+    for field, text in ray_fields(program, struct).items():
+        yield f"    {_declared(field)} /* {text} */"
+    yield f"}} @{struct};"
+    yield ""
 
 
 def _struct(program: Program, struct: str) -> Iterator[str]:
-    tree = program.trees[struct]
-    yield from _comment([STRUCTS[struct]])
+    yield from comment([STRUCTS[struct]])
     yield f"typedef struct @{struct} {{"
-    yield from _members(program.fields(struct), tree, meanings(tree), 0)
+    yield from _members(members_of(program.fields(struct)), meanings(program.trees[struct]), ())
     yield f"}} @{struct};"
     yield ""
 
 
 def _members(
-    fields: Sequence[Field], tree: PyTree, texts: Mapping[tuple[str, ...], str], depth: int
+    members: Members, texts: Mapping[tuple[str, ...], str], path: tuple[str, ...]
 ) -> Iterator[str]:
-    indent = "    " * (depth + 1)
-    for name, group in groupby(fields, lambda field: field.path[depth]):
-        members = [field for field in group if field.size]
-        if not members:
-            continue
-        path = members[0].path[: depth + 1]
-        if text := texts.get(path):
-            yield from _comment([text], indent)
-        if len(members[0].path) > depth + 1:
-            yield f"{indent}struct {{"
-            yield from _members(members, tree, texts, depth + 1)
-            yield f"{indent}}} {name};"
+    indent = "    " * (len(path) + 1)
+    for name, member in members.items():
+        within = (*path, name)
+        if text := texts.get(within):
+            yield from comment([text], indent)
+        if isinstance(member, Field):
+            yield indent + _declared(member)
         else:
-            sizes = "".join(f"[{size}]" for size in members[0].shape)
-            yield f"{indent}{C_TYPES[members[0].kind]} {name}{sizes};"
+            yield f"{indent}struct {{"
+            yield from _members(member, texts, within)
+            yield f"{indent}}} {name};"
+
+
+def _declared(field: Field) -> str:
+    sizes = "".join(f"[{size}]" for size in field.shape)
+    return f"{C_TYPES[field.kind]} {field.path[-1]}{sizes};"
 
 
 def _work(schedule: Schedule) -> list[str]:
@@ -234,15 +177,14 @@ def _work(schedule: Schedule) -> list[str]:
     return ["typedef struct @work {", *(arrays or ["    int unused;"]), "} @work;", ""]
 
 
-def _initialiser(fields: Sequence[Field], values: Iterator[np.ndarray], depth: int) -> str:
-    parts = []
-    for name, group in groupby(fields, lambda field: field.path[depth]):
-        members = list(group)
-        if len(members[0].path) > depth + 1:
-            parts.append(_initialiser(members, values, depth + 1))
-        else:
-            parts.append(f"{_braced(next(values))} /* {name} */")
+def _initialiser(members: Members, values: Mapping[Field, np.ndarray], depth: int) -> str:
     indent = "    " * (depth + 1)
+    parts = (
+        f"{_braced(values[member])} /* {name} */"
+        if isinstance(member, Field)
+        else _initialiser(member, values, depth + 1)
+        for name, member in members.items()
+    )
     listed = ",\n".join(f"{indent}{part}" for part in parts)
     return f"{{\n{listed}\n{indent[4:]}}}"
 

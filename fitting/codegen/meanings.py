@@ -5,7 +5,7 @@ import functools
 import hashlib
 import inspect
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from typing import NamedTuple
 
@@ -16,10 +16,12 @@ from jaxtyping import PyTree
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Rule
 
-from .graph import BOOL, FLOAT
+from .axes import ENGINES
+from .graph import BOOL, FLOAT, INT, UNSIGNED
 from .memory import words
-from .program import Program
+from .program import Field, Program
 
+COLUMNS = 96
 STRUCTS = {
     "parameters": "The numbers of the system; @defaults has those that it was made from.",
     "rig": "What a leg is, apart from its pose.",
@@ -27,6 +29,21 @@ STRUCTS = {
     "frame": "One frame of animation, before foot IK.",
     "result": "One frame after foot IK.",
 }
+RAYS = {
+    "ray": "A ray that the engine is to cast, world space.",
+    "hit": "What a ray hits, world space.",
+}
+USE = """\
+Use: @init makes the state of a character. In each frame call, in this order,
+
+{calls}
+
+Each of these but the last adds rays behind those that are there. Cast them before the next call:
+from their origins along their directions, as far as their lengths, onto the layers of their masks.
+Of what rays[i] hits, write point and normal to hits[i], and 1 to its found, or 0 if it hits
+nothing{platforms}. Rays, hits and work need not be kept from one frame to the next. Nothing is
+allocated, and there is no other memory: characters may be computed in parallel."""
+BLANK_FRAME = "A frame to begin with: full foot IK, on the ground, footholds unknown."
 AXES = """\
 Axes: x left, y up, z forward in model space; metres, seconds, radians; quaternions are w x y z. Of
 names, _ws is world space, _ms model space, and _ls the space of a joint; a_from_b takes points from
@@ -55,6 +72,64 @@ def origin(program: Program) -> list[str]:
         numbers = " ".join(map(str, program.order))
         head.append(f"In `jaxik.step`, the rays have the numbers {numbers}.")
     return head
+
+
+def use(program: Program, calls: Sequence[str]) -> list[str]:
+    """How an engine uses a program, in a paragraph each, of which the calls are one."""
+    moving = ", and to its platform the number of what moves, or -1" if program.platforms else ""
+    return USE.format(calls="\n".join(calls), platforms=moving).split("\n\n")
+
+
+def engine_axes(engine: str, more: str = "") -> str:
+    """What the axes of an engine are, and what is converted from them."""
+    return (
+        f"{engine.capitalize()}: {ENGINES[engine].meaning}{more}. Model space and world space are "
+        "converted alike, and rotations of joints."
+    )
+
+
+def ray_fields(program: Program, struct: str) -> dict[Field, str]:
+    """The arrays of a struct of `RAYS`, and what each is."""
+    if struct == "ray":
+        return {
+            Field(("origin",), FLOAT, (3,), True): "m",
+            Field(("direction",), FLOAT, (3,), True): "unit",
+            Field(("length",), FLOAT, ()): "m",
+            Field(("layers",), UNSIGNED, ()): "those that it can hit, one bit each",
+        }
+    platform = {Field(("platform",), INT, ()): "what moves, or -1"} if program.platforms else {}
+    return {
+        Field(("point",), FLOAT, (3,), True): "m",
+        Field(("normal",), FLOAT, (3,), True): "unit",
+        Field(("found",), FLOAT, ()): "1, or 0 of a miss, of which nothing else counts",
+    } | platform
+
+
+def comment(
+    paragraphs: Sequence[str],
+    indent: str = "",
+    marks: tuple[str, str, str] = ("/* ", "   ", " */"),
+) -> list[str]:
+    """The lines of a comment.
+
+    Args:
+        paragraphs: what it says; those that are indented stay as they are.
+        indent: of all lines.
+        marks: before the first line, before each other one, and behind the last.
+    """
+    start, rest, end = marks
+    filled = [
+        line
+        for paragraph in paragraphs
+        for line in (
+            [*paragraph.split("\n"), ""]
+            if paragraph.startswith(" ")
+            else [*textwrap.wrap(paragraph.replace("*/", "* /"), COLUMNS - len(indent)), ""]
+        )
+    ][:-1]
+    lines = [f"{indent}{rest if i else start}{line}".rstrip() for i, line in enumerate(filled)]
+    lines[-1] += end
+    return lines
 
 
 def digest(tree: PyTree) -> str:

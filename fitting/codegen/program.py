@@ -5,7 +5,8 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from itertools import groupby
+from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from jaxik.world.skeleton import LegPose, Transform
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, from_hits
 
 from . import stablehlo
-from .graph import BOOL, FLOAT, INT, UNSIGNED, Graph, Node
+from .graph import BOOL, DTYPES, FLOAT, INT, UNSIGNED, Graph, Node
 from .schedule import Schedule, Target, plan
 
 KINDS = {"f": FLOAT, "i": INT, "u": UNSIGNED, "b": BOOL}
@@ -37,11 +38,17 @@ class Field(NamedTuple):
     """Names of the structs in which it lies, then its own."""
     kind: str
     shape: tuple[int, ...]
+    is_vector: bool = False
+    """Whether its last axis is that of vectors or quaternions."""
 
     @property
     def size(self) -> int:
         """How many numbers it has."""
         return math.prod(self.shape)
+
+
+Members: TypeAlias = "dict[str, Field | Members]"
+"""Of a struct, by their names: arrays, and structs within it."""
 
 
 class Place(NamedTuple):
@@ -227,6 +234,18 @@ def _build(
     )  # fmt: skip
 
 
+def constants_of(program: Program) -> dict[str, tuple[str, dict[Field, np.ndarray]]]:
+    """By their names, structs that code holds, and their values with floats of 32 bits.
+
+    They are the parameters that the program was made from, and a frame to begin with.
+    """
+    leaves = (np.asarray(leaf) for leaf in jax.tree.leaves(program.ik))
+    numbers = (leaf.astype(DTYPES[KINDS[leaf.dtype.kind]]) for leaf in leaves)
+    defaults = dict(zip(program.fields("parameters"), numbers, strict=True))
+    frame = {field: blank_value(field) for field in program.fields("frame")}
+    return {"defaults": ("parameters", defaults), "blank_frame": ("frame", frame)}
+
+
 def places_of(struct: str, tree: PyTree) -> Iterator[Place]:
     """All numbers of a struct, in order."""
     for field in fields_of(tree):
@@ -237,9 +256,52 @@ def places_of(struct: str, tree: PyTree) -> Iterator[Place]:
 def fields_of(tree: PyTree) -> list[Field]:
     """The arrays of a tree of structs, in their order."""
     return [
-        Field(tuple(map(_name, path)), KINDS[np.dtype(leaf.dtype).kind], tuple(leaf.shape))
+        Field(
+            tuple(map(_name, path)),
+            KINDS[np.dtype(leaf.dtype).kind],
+            tuple(leaf.shape),
+            _is_vector(tree, path),
+        )
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     ]
+
+
+def _is_vector(tree: PyTree, path: Sequence[Any]) -> bool:
+    """Whether the class in which an array lies declares a last axis of 3 or 4 numbers."""
+    for key in path[:-1]:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            tree = getattr(tree, key.name)
+        else:
+            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]
+    return bool(path) and _name(path[-1]) in _vectors(type(tree))
+
+
+@functools.cache
+def _vectors(cls: type) -> set[str]:
+    """The fields of a class with such an axis."""
+    vectors, hints = set(), get_type_hints(cls)
+    for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
+        hint, shape = hints[field.name], field.metadata.get("shape", ())
+        axes = [getattr(kind, "dim_str", "").split()[-1:] for kind in (hint, *get_args(hint))]
+        if ["3"] in axes or ["4"] in axes or shape[-1:] in ((3,), (4,)):
+            vectors.add(field.name)
+    return vectors
+
+
+def members_of(fields: Sequence[Field], depth: int = 0) -> Members:
+    """The members of a struct with these arrays, as far as they have numbers.
+
+    Args:
+        fields: in their order.
+        depth: in how many structs this one lies.
+    """
+    members: Members = {}
+    for name, group in groupby(fields, lambda field: field.path[depth]):
+        within = [field for field in group if field.size]
+        if within:
+            is_array = len(within[0].path) == depth + 1
+            members[name] = within[0] if is_array else members_of(within, depth + 1)
+    return members
 
 
 def _name(key: Any) -> str:
