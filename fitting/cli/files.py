@@ -31,7 +31,7 @@ from .terminal import show
 if TYPE_CHECKING:
     from jaxik.record import Reading, Record
 
-LANGUAGES = ("c",)  # of code
+LANGUAGES = ("c", "cs")  # of code
 TEMPLATE = Path()
 """What `--joints` is without a file: no name that a file can have."""
 
@@ -276,7 +276,7 @@ record = Command(
     ),
 )  # fmt: skip
 def export(options: argparse.Namespace) -> int:
-    """Write parameters as TOML, JSON, the game's record, settings or C code.
+    """Write parameters as TOML, JSON, the game's record, settings or code.
 
     jaxik export runs/walk -o walk.json               parameters under our names
     jaxik export runs/walk -o footik.bin              the game's record, or as .csv
@@ -284,10 +284,11 @@ def export(options: argparse.Namespace) -> int:
     jaxik export walk.csv -o parameters.toml          and back
     jaxik export runs/walk --as c -o walk             the system itself, as C code
     jaxik export runs/walk --as c -o walk --trace walk.bvh --terrain steps.obj
+    jaxik export runs/walk --as cs -o walk --axes unity    and in C#, for Unity
 
     What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
     it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's
-    inspector, as .toml, .json or .csv. C code needs no library, and its header says how an engine
+    inspector, as .toml, .json or .csv. Code needs no library, and says in its head how an engine
     calls it and casts its rays.
     """
     from fitting import jobs

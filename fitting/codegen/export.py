@@ -11,7 +11,7 @@ import jaxik
 from fitting.runtime import activity, files
 from jaxik.world.terrain import LegTerrains, Terrain
 
-from . import c_files, trace
+from . import c_files, cs_files, trace
 from .axes import ENGINES
 from .program import Program, build
 
@@ -28,7 +28,10 @@ class Language(NamedTuple):
     """What replays a golden trace."""
 
 
-LANGUAGES = {"c": Language(c_files.sources, c_files.check)}
+LANGUAGES = {
+    "c": Language(c_files.sources, c_files.check),
+    "cs": Language(cs_files.sources, cs_files.check),
+}
 
 
 class GoldenTrace(NamedTuple):
@@ -50,8 +53,9 @@ def export_system(
     frame: jaxik.Frame | None = None,
     golden: GoldenTrace | None = None,
 ) -> Program:
-    """Writes a system in another language: "c", `NAME.h` and `NAME.c`, is C99 that is also C++11.
+    """Writes a system in another language.
 
+    "c", `NAME.h` and `NAME.c`, is C99 that is also C++11; "cs", `Name.cs`, is C# 7.2 for Unity.
     Its answers are those of `jaxik.step` with hard decisions in 32 bits, but for rounding. The
     engine casts the rays; the comments say how. Parameters stay inputs.
 

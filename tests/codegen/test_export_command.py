@@ -1,4 +1,4 @@
-"""`jaxik export --as c`: files, a trace that a C program replays, and mistakes in one line."""
+"""`jaxik export` of code: files, a trace that a program replays, and mistakes in one line."""
 
 import subprocess
 
@@ -8,8 +8,10 @@ import pytest
 from fitting.cli import main
 from fitting.clips import load_clip, save_clip
 from fitting.codegen import toolchain
+from support import mono
 from support.commands import refusal
 from support.experiments import ROOT
+from support.mono import needs_mono
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "slope.ply"
@@ -50,6 +52,25 @@ def test_a_trace_of_a_clip_is_replayed_by_a_program_in_c(tmp_path, parameters, c
     assert subprocess.run(["./check"], cwd=folder, capture_output=True).returncode == 1
 
 
+@pytest.mark.slow
+@needs_mono
+def test_a_trace_of_a_clip_is_replayed_by_a_program_in_csharp(tmp_path, parameters):
+    folder, clip = tmp_path / "code", load_clip(BASE)
+    save_clip(tmp_path / "walk.npz", clip.select(slice(0, 5)))
+    words = ["export", parameters, "--as", "cs", "-o", folder, "--name", "one_walker"]
+    words += ["--trace", tmp_path / "walk.npz", "--terrain", GROUND]
+    assert main.main([str(word) for word in words]) == 0
+    assert {path.name for path in folder.iterdir()} == {"OneWalker.cs", "Check.cs", "trace.bin"}
+    mono.compile_code(folder, "Check.exe", "OneWalker.cs", "Check.cs")
+    done = mono.run(folder, "Check.exe")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("5 frames, largest difference ")
+    damaged = bytearray((folder / "trace.bin").read_bytes())
+    damaged[-40:-36] = b"\0\0\0\x42"  # a number of the last result
+    (folder / "trace.bin").write_bytes(damaged)
+    assert mono.run(folder, "Check.exe").returncode == 1
+
+
 def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, parameters):
     main.main(["export", str(parameters), "--as", "c", "-o", str(tmp_path), "--legs", "1"])
     header, code = ((tmp_path / f"footik.{kind}").read_text() for kind in "hc")
@@ -67,6 +88,11 @@ def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, paramet
         (["--as", "c", "--drop"], "--drop: only for a record and for settings"),
         (["--as", "c", "--terrain", GROUND], "--terrain: the ground under a clip; wanted --trace"),
         (["--as", "c", "--trace", "none.npz"], "none.npz"),
+        pytest.param(
+            ["--as", "cs", "--name", "frame"],
+            "name is 'frame'; wanted another one: code in C# has a Frame within",
+            marks=pytest.mark.slow,
+        ),
         (["--as", "c", "--name", "Walk!"], "name is 'Walk!'; wanted small letters, digits and"),
         (["--as", "c", "--trace", BASE, "--terrain", GROUND, "--legs", "3"], "--legs: a trace has"),
     ],

@@ -24,6 +24,7 @@ from jaxik.world import terrain
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Hit
 from support.clips import make_rig, to_frames, to_rig, wandering
+from support.mono import DOUBLES, Mono
 
 CLOSE = 1e-5  # m, and of a quaternion
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -33,6 +34,8 @@ BUILDS = {
     "g++": ("g++", "-x", "c++", "-std=c++11", "-O2", *STRICT),
     "clang": ("clang", "-std=c99", "-O2", *STRICT),
     "clang, native": ("clang", "-std=c99", "-O3", "-march=native", *STRICT),
+    "C#": ("mono",),
+    "C#, in doubles": ("mono", DOUBLES),
 }
 BUGS = (np.nan, np.inf, -np.inf, 3e38)
 DENORMAL = 1e-42  # which JAX takes for 0
@@ -158,10 +161,14 @@ def first_of(frames: jaxik.Frame) -> jaxik.Frame:
 
 
 def played(case: Case, folder: Any, command: tuple[str, ...], *, chained: bool) -> Outputs:
-    program = export.export_c(
-        case.ik, case.rig, folder, terrain=case.ground, frame=first_of(case.frames)
-    )
-    compiled = Compiled(program, folder, "footik", command)
+    program = export.export_system(
+        case.ik, case.rig, folder, language="cs" if command[0] == "mono" else "c",
+        terrain=case.ground, frame=first_of(case.frames),
+    )  # fmt: skip
+    if command[0] == "mono":
+        compiled = Mono(program, folder, "footik", *command[1:])
+    else:
+        compiled = Compiled(program, folder, "footik", command)
     starts = None if chained else case.starts
     play = Playback(compiled, (case.ik, case.rig), case.frames, case.hits, starts)
     play()
@@ -193,20 +200,22 @@ def test_ten_thousand_frames_of_a_preset_are_those_of_jax(name, tmp_path):
             assert_agreement(case, tmp_path, command)
 
 
+@pytest.mark.parametrize("build", ["gcc", "C#"])
 @pytest.mark.parametrize("legs", [1, 4, 8])
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
-def test_rigs_of_other_legs_are_those_of_jax(name, legs, tmp_path):
-    assert_agreement(make_case(name, legs, 500, bugs=2), tmp_path, BUILDS["gcc"])
+def test_rigs_of_other_legs_are_those_of_jax(name, legs, build, tmp_path):
+    assert_agreement(make_case(name, legs, 500, bugs=2), tmp_path, BUILDS[build])
 
 
+@pytest.mark.parametrize("build", ["gcc", "C#"])
 @pytest.mark.parametrize("name", ["record", "mec"])
-def test_platforms_and_ups_of_legs_are_those_of_jax(name, tmp_path):
+def test_platforms_and_ups_of_legs_are_those_of_jax(name, build, tmp_path):
     still, moving = hills(), terrain.moving(terrain.plane((0.0, 0.05, 0.0), (0.1, 1.0, 0.0)), 0)
     side = terrain.plane((0.6, 0.0, 0.0), up=(0.3, 1.0, -0.1))
     ground = single(terrain.LegTerrains(still, (terrain.combine(still, moving), side)))
     case = make_case_on_platform(name, ground)
     assert {-1, 0} <= set(case.hits.platform.ravel().tolist())
-    assert_agreement(case, tmp_path, BUILDS["gcc"])
+    assert_agreement(case, tmp_path, BUILDS[build])
 
 
 def make_case_on_platform(name: str, ground: Any) -> Case:
