@@ -32,7 +32,10 @@ from .meanings import (
 from .program import Field, Members, Program, constants_of, members_of
 from .schedule import Schedule
 
+FOLDER = Path(__file__).parent
 CODE, CHECK = "code.cs", "Check.cs"
+NODES = {"unity": ("unity.cs", "@TITLEBehaviour.cs")}
+"""For an engine: what calls the code there, and the name of its file."""
 NEEDS = """\
 Needs C# 7.2 and Span, as Unity has from 2021.2 on, where it takes vectors from Unity.Mathematics.
 Rays and hits are arrays, or native arrays as spans. All structs are blittable, and Burst compiles
@@ -42,7 +45,7 @@ Names: TypeAlias = tuple[str, ...]
 
 
 def sources(program: Program, name: str, engine: str | None = None) -> dict[str, str]:
-    """The code, by the name of its file; see `export.Language`.
+    """The code and the component of an engine; see `export.Language`.
 
     Raises:
         ValueError: something in the code has this name.
@@ -69,24 +72,38 @@ def sources(program: Program, name: str, engine: str | None = None) -> dict[str,
     if title == "Check" or re.search(rf"^    public [^=({{;]*\b{title}\b", content, re.MULTILINE):
         raise ValueError(f"name is {name!r}; wanted another one: code in C# has a {title} within")
     parts = {"@HEAD": _head(program), "@MEMBERS": content}
-    return {f"{title}.cs": filled(fill(_template(CODE), parts), program, name)}
+    contents = {"@TITLE.cs": fill(_template(FOLDER / CODE), parts)}
+    if engine in NODES:
+        template, file = NODES[engine]
+        contents[file] = _template(FOLDER / "engines" / template)
+    return {
+        filled(file, program, name): filled(text, program, name) for file, text in contents.items()
+    }
 
 
 def check(program: Program, name: str) -> dict[str, str]:
     """What replays a trace of this program."""
-    return {CHECK: filled(_template(CHECK), program, name)}
+    return {CHECK: filled(_template(FOLDER / CHECK), program, name)}
 
 
 def filled(template: str, program: Program, name: str) -> str:
     """A text in C# with the names of a program, and the calls of a frame, in it."""
-    title = pascal(name)
-    calls = (f"            {title}.{call}" for call in calls_of(program, cs_code.call))
-    text = fill(template, {"@CALLS": "\n".join(calls), "@TITLE": title})
+    calls = {
+        word: "\n".join(f"        {line}" for line in _calls(program, casts=casts))
+        for word, casts in (("@CALLS", False), ("@CASTING", True))
+    }
+    still = {"@STILL": " hits[i].Platform = -1;" if program.platforms else ""}
+    text = fill(template, calls | still | {"@TITLE": pascal(name)})
     return re.sub(r"@(\w+)", lambda name: pascal(name[1]), text)
 
 
-def _template(file: str) -> str:
-    return Path(__file__).with_name(file).read_text(encoding="utf-8")
+def _calls(program: Program, *, casts: bool = False) -> list[str]:
+    lines = calls_of(program, lambda *phase: f"@TITLE.{cs_code.call(*phase)}", casts=casts)
+    return [line.replace("cast(", "Cast(") for line in lines]
+
+
+def _template(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
 
 
 def _head(program: Program) -> str:
@@ -94,7 +111,7 @@ def _head(program: Program) -> str:
         "quaternions are w x y z": "quaternions are those of Unity.Mathematics",
         " Flags are 1 or 0.": "",
     })  # fmt: skip
-    calls = [f"    @TITLE.{call}" for call in calls_of(program, cs_code.call)]
+    calls = [f"    {line}" for line in _calls(program)]
     return "\n".join(comment([*origin(program), NEEDS, *use(program, calls), _named(axes)]))
 
 

@@ -1,8 +1,9 @@
-"""What calls generated code in Unreal Engine and in Godot: compiled against as much of them as it
-needs, it moves a character as `jaxik.step` does, in the engine's own axes."""
+"""What calls generated code in Unreal Engine, Unity and Godot: compiled against as much of them as
+it needs, it moves a character as `jaxik.step` does, in the engine's own axes."""
 
 # pyright: reportArgumentType=false
 
+import functools
 import subprocess
 from pathlib import Path
 
@@ -16,16 +17,22 @@ from fitting.bench import workloads
 from fitting.codegen import export, toolchain
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support import mono
 from support.clips import make_rig, to_frames, wandering
 
 FRAMES = 40
 TILTED = Rotation.from_euler("xyz", [0.1, 0.2, -0.1]).as_quat(scalar_first=True)
 ENGINES = Path(__file__).parent / "engines"
-SLOPE = 0.1  # up to the right in Unreal, up along x in Godot
+SLOPE = 0.1  # up to the right in Unreal and Unity, up along x in Godot
 # Columns: the engine's axes in ours. Unreal's mesh faces y: its component is turned by 90°.
-MATRICES = {"unreal": np.transpose([(0, 0, 1), (-1, 0, 0), (0, 1, 0)]), "godot": np.eye(3)}
-UNITS, FACING = {"unreal": 0.01, "godot": 1.0}, {"unreal": 90.0, "godot": 0.0}
-NORMALS = {"unreal": (SLOPE, 1.0, 0.0), "godot": (-SLOPE, 1.0, 0.0)}
+MATRICES = {
+    "unreal": np.transpose([(0, 0, 1), (-1, 0, 0), (0, 1, 0)]),
+    "unity": np.diag([-1.0, 1.0, 1.0]),
+    "godot": np.eye(3),
+}
+UNITS = {"unreal": 0.01, "unity": 1.0, "godot": 1.0}
+FACING = {"unreal": 90.0, "unity": 0.0, "godot": 0.0}
+NORMALS = {"unreal": (SLOPE, 1.0, 0.0), "unity": (SLOPE, 1.0, 0.0), "godot": (-SLOPE, 1.0, 0.0)}
 
 
 def to_engine(engine: str, transforms: jaxik.Transform) -> jaxik.Transform:
@@ -62,11 +69,9 @@ def joints(pose: jaxik.LegPose) -> jaxik.Transform:
     return jax.tree.map(lambda *leaves: np.stack(leaves, 2).reshape(FRAMES, 8, -1), *parts)
 
 
-@pytest.mark.parametrize("engine", ["unreal", "godot"])
-def test_a_node_moves_a_character_as_python_does(tmp_path, engine):
-    compiler = toolchain.compiler("c++")
-    if compiler is None:
-        pytest.skip("needs a compiler of C++: none in $CXX, no c++")
+@functools.cache
+def solved(normal: tuple[float, float, float]) -> tuple:
+    """A system, its rig, frames, and what JAX makes of them on a slope."""
     frames = to_frames(wandering(make_rig(), np.random.default_rng(2), FRAMES))
     frames = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), frames)
     builder, parts = jaxik.FrameBuilder(), []
@@ -78,15 +83,33 @@ def test_a_node_moves_a_character_as_python_does(tmp_path, engine):
     ik = parameter_tree.replace(jaxik.presets.unreal(rig), {"contact.idle_speed": 9.0})
     ik = workloads.single(ik)
     with jax.enable_x64(False):
-        ground = terrain.plane(normal=NORMALS[engine])
         quickly = {"xla_backend_optimization_level": 0}
         run = jax.jit(jaxik.run, compiler_options=quickly)
-        result = jax.device_get(run(ik, rig, ground, frames))
+        return ik, rig, frames, jax.device_get(run(ik, rig, terrain.plane(normal=normal), frames))
 
-    export.export_c(ik, rig, tmp_path, axes=engine)
-    source = ENGINES / engine / "run.cpp"
-    command = [compiler, "-std=c++17", "-Wall", "-Werror", "-O0", "-I", source.parent, "-I", "."]
-    subprocess.run([*command, source, "footik.c", "-o", "run", "-lm"], cwd=tmp_path, check=True)
+
+def built(engine: str, folder: Path, ik: jaxik.FootIK, rig: jaxik.Rig) -> list[str]:
+    """The command that runs a node over frames."""
+    language, place = "cs" if engine == "unity" else "c", ENGINES / engine
+    export.export_system(ik, rig, folder, language=language, axes=engine)
+    if engine == "unity":
+        files = ["Footik.cs", "FootikBehaviour.cs", *map(str, sorted(place.glob("*.cs")))]
+        mono.compile_code(folder, "run.exe", "-define:UNITY_5_3_OR_NEWER", "-nowarn:649", *files)
+        return [str(mono.MONO), "run.exe"]
+    command = [str(toolchain.compiler("c++")), "-std=c++17", "-Wall", "-Werror", "-O0"]
+    command += ["-I", place, "-I", ".", place / "run.cpp", "footik.c", "-o", "run", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    return ["./run"]
+
+
+@pytest.mark.parametrize(
+    "engine", ["unreal", pytest.param("unity", marks=mono.needs_mono), "godot"]
+)
+def test_a_node_moves_a_character_as_python_does(tmp_path, engine):
+    if engine != "unity" and toolchain.compiler("c++") is None:
+        pytest.skip("needs a compiler of C++: none in $CXX, no c++")
+    ik, rig, frames, result = solved(NORMALS[engine])
+    command = built(engine, tmp_path, ik, rig)
     facing = Rotation.from_euler("z", FACING[engine], degrees=True)
     places = np.tile([0.02, 0.9, 0.1], (FRAMES, 1, 1))
     pelvis = jaxik.Transform(places, np.tile(TILTED, (FRAMES, 1, 1)))
@@ -95,7 +118,7 @@ def test_a_node_moves_a_character_as_python_does(tmp_path, engine):
     roots = numbers_of(to_engine(engine, frames.world_from_model))
     roots[:, 3:] = (Rotation.from_quat(roots[:, 3:]) * facing.inv()).as_quat()
     feed = bones[0].tobytes() + np.concatenate([roots[:, None], bones], axis=1).tobytes()
-    done = subprocess.run([tmp_path / "run"], input=feed, capture_output=True, check=True)
+    done = subprocess.run(command, cwd=tmp_path, input=feed, capture_output=True, check=True)
     moved = turned(np.frombuffer(bytearray(done.stdout)).reshape(FRAMES, 9, 7), facing.inv())
 
     ours = from_engine(engine, moved)
