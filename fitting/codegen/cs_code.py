@@ -154,15 +154,15 @@ class CSharp(Language):
             return PLATFORM
         if place.struct == "hits":
             ray, *index = place.index
-            return f"hits[{ray}].{_member(place.field, index)}"
-        return f"{place.struct}.{_member(place.field, place.index)}"
+            return f"hits[{ray}].{member_of(place.field, index)}"
+        return f"{place.struct}.{member_of(place.field, place.index)}"
 
     def output(self, target: Target, place: Place | None) -> str:
         if place is None:
             axis = f".{'xyz'[target.axis]}" if target.name in ("origin", "direction") else ""
             return f"rays[{target.number}].{pascal(target.name)}{axis}"
         struct = "after" if place.struct == "state" else place.struct
-        return f"{struct}.{_member(place.field, place.index)}"
+        return f"{struct}.{member_of(place.field, place.index)}"
 
     def part(self, name: str, lines: Sequence[str]) -> tuple[str, list[str]]:
         body = body_of(lines)
@@ -261,7 +261,7 @@ def _entries(calls: Sequence[Sequence[tuple[str, list[str]]]]) -> Iterator[str]:
         yield f"public static void @{phase_name(phase, rounds)}({heads}) {{\n{body_of(lines)}\n}}"
 
 
-def _member(field: Field, index: Sequence[int]) -> str:
+def member_of(field: Field, index: Sequence[int]) -> str:
     """A number of an array, in the struct in which that lies."""
     names, axis = list(map(pascal, field.path)), ""
     if field.is_vector:

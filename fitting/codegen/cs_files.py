@@ -12,7 +12,7 @@ import numpy as np
 
 from . import cs_code
 from .axes import conversions
-from .cs_code import FIELD_TYPES, literal, pascal, type_of
+from .cs_code import FIELD_TYPES, literal, member_of, pascal, type_of
 from .functions import LETTERS, calls_of, fill
 from .graph import BOOL, FLOAT
 from .meanings import (
@@ -40,6 +40,15 @@ NEEDS = """\
 Needs C# 7.2 and Span, as Unity has from 2021.2 on, where it takes vectors from Unity.Mathematics.
 Rays and hits are arrays, or native arrays as spans. All structs are blittable, and Burst compiles
 what is called within a job."""
+SLIDER = """\
+/// <summary>A parameter, for a panel of sliders.</summary>
+public struct Slider {
+    public string Name, Unit, Meaning;
+    public float Value, Low, High;
+    public Slider(string name, string unit, string meaning, float value, float low, float high) {
+        Name = name; Unit = unit; Meaning = meaning; Value = value; Low = low; High = high;
+    }
+}"""
 SUMMARY = ("/// <summary>", "/// ", "</summary>")
 Names: TypeAlias = tuple[str, ...]
 
@@ -63,6 +72,7 @@ def sources(program: Program, name: str, engine: str | None = None) -> dict[str,
         *structs,
         *map(_array, arrays),
         *_constants(program),
+        *_sliders(program),
         *code.entries,
         *(_documented(routine.meaning, text) for routine, text in code.routines),
         *(_conversions(engine) if engine else ()),
@@ -132,6 +142,7 @@ def _documented(text: str, declaration: str) -> str:
 
 def _counts(program: Program) -> str:
     counts = {"LegCount": program.legs, "RayCount": program.ray_count}
+    counts["SliderCount"] = len(table(program))
     counts |= {f"RayCount{i}": len(rays) for i, rays in enumerate(program.rounds, 1)}
     listed = ", ".join(f"{name} = {count}" for name, count in counts.items())
     return f"public const int {listed};"
@@ -204,28 +215,51 @@ def _work(schedule: Schedule) -> str:
 
 def _array(size: int) -> str:
     """Values one after another, in a struct that can lie in others."""
-    places = range(size)
-    throw = "default: throw new IndexOutOfRangeException();"
-    return "\n".join([
-        *_summary(f"{size} values, with indices from 0."),
-        *_block(f"Array{size}<T> where T : struct", [
-            f"public T {', '.join(f'e{place}' for place in places)};",
-            "public T this[int index] {",
-            "    get {",
-            "        switch (index) {",
-            *(f"            case {place}: return e{place};" for place in places),
-            f"            {throw}",
-            "        }",
-            "    }",
-            "    set {",
-            "        switch (index) {",
-            *(f"            case {place}: e{place} = value; break;" for place in places),
-            f"            {throw}",
-            "        }",
-            "    }",
-            "}",
-        ]),
-    ])  # fmt: skip
+    names = [f"e{place}" for place in range(size)]
+    body = [
+        f"public T {', '.join(names)};",
+        "public T this[int index] {",
+        *_switch("    get", (f"return {name};" for name in names)),
+        *_switch("    set", (f"{name} = value; break;" for name in names)),
+        "}",
+    ]
+    text = _summary(f"{size} values, with indices from 0.")
+    return "\n".join([*text, *_block(f"Array{size}<T> where T : struct", body)])
+
+
+def _switch(head: str, cases: Iterable[str]) -> Iterator[str]:
+    """A function that does something else for each index."""
+    indent = " " * (len(head) - len(head.lstrip()))
+    yield f"{head} {{"
+    yield f"{indent}    switch (index) {{"
+    yield from (f"{indent}        case {index}: {case}" for index, case in enumerate(cases))
+    yield f"{indent}        default: throw new IndexOutOfRangeException();"
+    yield f"{indent}    }}"
+    yield f"{indent}}}"
+
+
+def _sliders(program: Program) -> Iterator[str]:
+    """Parameters by their numbers, for a panel in a game."""
+    getters, setters, places = [], [], program.places["parameters"]
+    for entry in table(program):
+        place = places[entry.number]
+        name = f"parameters.{member_of(place.field, place.index)}"
+        words = name.removeprefix("parameters."), entry.unit, _named(entry.meaning)
+        parts = [json.dumps(word, ensure_ascii=False) for word in words]
+        is_switch = place.field.kind == BOOL
+        parts.append(f"{name} ? 1f : 0f" if is_switch else name)
+        parts += (literal(np.float32(end)) for end in (entry.low, entry.high))
+        getters.append(f"return new Slider({', '.join(parts)});")
+        setters.append(f"{name} = {'value >= 0.5f' if is_switch else 'value'}; break;")
+    yield SLIDER
+    yield _documented(
+        "A parameter as it is, with its range; a switch has 0 to 1.",
+        "\n".join(
+            _switch("public static Slider GetSlider(in Parameters parameters, int index)", getters)
+        ),
+    )
+    head = "public static void SetSlider(ref Parameters parameters, int index, float value)"
+    yield _documented("Changes a parameter.", "\n".join(_switch(head, setters)))
 
 
 def _constants(program: Program) -> Iterator[str]:

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.bench import workloads
-from fitting.codegen import c_files, memory, program, toolchain
+from fitting.codegen import c_files, cs_files, meanings, memory, program, toolchain
 from fitting.codegen.axes import ENGINES, conversions
 from jaxik.maths import parameter_tree
+from support import mono
 
 # Of each engine: what its axes are in ours (x left, y up, z forward), and its unit in m.
 AXES = {
@@ -22,6 +23,23 @@ AXES = {
     "unity": ([(-1, 0, 0), (0, 1, 0), (0, 0, 1)], 1.0),  # right, up, forward
     "godot": ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], 1.0),  # MODEL_LEFT, up, MODEL_FRONT
 }
+
+
+SLIDERS = """\
+using Jaxik;
+static class Sliders {
+    static void Main() {
+        Walker.Parameters parameters = Walker.Defaults;
+        for (int i = 0; i < Walker.SliderCount; i++) {
+            Walker.Slider s = Walker.GetSlider(in parameters, i);
+            Walker.SetSlider(ref parameters, i, s.High);
+            float after = Walker.GetSlider(in parameters, i).Value;
+            string numbers = $"{s.Value:r}|{s.Low:r}|{s.High:r}|{after:r}";
+            System.Console.WriteLine($"{s.Name}|{s.Unit}|{s.Meaning}|{numbers}");
+        }
+    }
+}
+"""
 
 
 def compiled(folder, system: program.Program, engine: str | None) -> ctypes.CDLL:
@@ -120,6 +138,23 @@ def test_sliders_say_what_each_parameter_is(library, system):
             assert slider.value == defaults[slider.number]
             assert slider.unit.decode() == declaration.unit
         assert slider.meaning.decode() == parameter_tree.docs(system.ik)[name]
+
+
+@mono.needs_mono
+def test_sliders_in_csharp_turn_parameters(tmp_path, system):
+    for file, text in cs_files.sources(system, "walker").items():
+        (tmp_path / file).write_text(text)
+    (tmp_path / "Sliders.cs").write_text(SLIDERS)
+    mono.compile_code(tmp_path, "Sliders.exe", "Walker.cs", "Sliders.cs")
+    done = mono.run(tmp_path, "Sliders.exe")
+    rows = [line.split("|") for line in done.stdout.splitlines()]
+    for row, entry in zip(rows, meanings.table(system), strict=True):
+        texts = [text.lower().replace("_", "") for text in (entry.name, entry.unit, entry.meaning)]
+        *words, value, low, high, after = row
+        assert [word.lower() for word in words] == texts
+        numbers = [float(number) for number in (value, low, high, after)]
+        expected = [entry.value, entry.low, entry.high, entry.high]
+        np.testing.assert_allclose(numbers, expected, rtol=1e-6)
 
 
 def test_a_blank_frame_has_whole_weights_on_the_ground(library, system):
