@@ -79,7 +79,7 @@ def sources(program: Program, name: str, engine: str | None = None) -> dict[str,
         *code.parts,
     ]
     content = textwrap.indent("\n\n".join(members), "    ")
-    if title == "Check" or re.search(rf"^    public [^=({{;]*\b{title}\b", content, re.MULTILINE):
+    if re.search(rf"^    public [^=({{;]*\b{title}\b", content, re.MULTILINE):
         raise ValueError(f"name is {name!r}; wanted another one: code in C# has a {title} within")
     parts = {"@HEAD": _head(program), "@MEMBERS": content}
     contents = {"@TITLE.cs": fill(_template(FOLDER / CODE), parts)}

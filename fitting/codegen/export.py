@@ -16,6 +16,7 @@ from .axes import ENGINES
 from .program import Program, build
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
+TAKEN = ("check", "walk")  # by the programs that come with a trace
 TRACE = "trace.bin"
 
 
@@ -81,8 +82,11 @@ def export_system(
     """
     if language not in LANGUAGES:
         raise ValueError(f"language is {language!r}; wanted one of {list(LANGUAGES)}")
-    if not NAME.fullmatch(name):
-        raise ValueError(f"name is {name!r}; wanted small letters, digits and underscores")
+    if not NAME.fullmatch(name) or name in TAKEN:
+        raise ValueError(
+            f"name is {name!r}; wanted small letters, digits and underscores, but not "
+            f"{' or '.join(TAKEN)}"
+        )
     if axes is not None and axes not in ENGINES:
         raise ValueError(f"axes is {axes!r}; wanted one of {list(ENGINES)}")
     folder = Path(folder)

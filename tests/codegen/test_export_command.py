@@ -88,6 +88,7 @@ def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, paramet
         (["--as", "c", "--drop"], "--drop: only for a record and for settings"),
         (["--as", "c", "--terrain", GROUND], "--terrain: the ground under a clip; wanted --trace"),
         (["--as", "c", "--trace", "none.npz"], "none.npz"),
+        (["--as", "c", "--name", "check"], "name is 'check'; wanted small letters, digits and"),
         pytest.param(
             ["--as", "cs", "--name", "frame"],
             "name is 'frame'; wanted another one: code in C# has a Frame within",

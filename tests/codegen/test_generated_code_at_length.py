@@ -40,7 +40,7 @@ BUILDS = {
 BUGS = (np.nan, np.inf, -np.inf, 3e38)
 DENORMAL = 1e-42  # which JAX takes for 0
 ROUNDINGS = 8
-PARTED = 0.02  # of frames, while a decision that was taken a frame earlier or later fades
+PARTED = 0.02, 30  # of frames, and frames in all, while a decision of another frame fades
 pytestmark = pytest.mark.slow
 
 
@@ -188,7 +188,7 @@ def assert_agreement(case: Case, folder: Any, command: tuple[str, ...]) -> None:
         assert len(off) <= 1 + 0.001 * len(case.frames.dt)
     # In a row, a decision may fall a frame earlier or later, and its traces fade.
     parted = differences(chain.results, case.results) > CLOSE
-    assert np.mean(parted) < PARTED
+    assert np.sum(parted) < max(PARTED[0] * len(parted), PARTED[1])
 
 
 @pytest.mark.parametrize("name", ["record", "stride", "ozz", "mec", "unreal"])
@@ -259,7 +259,8 @@ def test_parameters_that_change_along_a_clip_are_those_of_jax(name, tmp_path):
     compiled = Compiled(program, tmp_path, "footik", BUILDS["gcc"])
     play = Playback(compiled, (tracked, case.rig), case.frames, hits, tracked=True)
     play()
-    assert np.mean(differences(play.outputs().results, results) > CLOSE) < PARTED
+    parted = differences(play.outputs().results, results) > CLOSE
+    assert np.sum(parted) < max(PARTED[0] * len(parted), PARTED[1])
 
 
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
