@@ -1,17 +1,18 @@
 """The live viewer of `jaxik view`: a clip in 3-D, solved again while its parameters are dragged.
 
 Only `page` knows of a browser, and of viser, an extra; only `views`, the job, imports it. `session`
-holds a run, or a clip on its ground, and a slider for each parameter; `solving` solves a clip and
+holds a run, or a clip on its ground; `solving` solves a clip and
 makes what is drawn of it; `tuning` is the history of changes, and how the result is saved.
 """
 
+from fitting.report.sliders import Slider as Slider
+from fitting.report.sliders import sliders as sliders
+
 from .session import Session as Session
 from .session import SessionClip as SessionClip
-from .session import Slider as Slider
 from .session import session_of_animation as session_of_animation
 from .session import session_of_fit as session_of_fit
 from .session import session_of_run as session_of_run
-from .session import sliders as sliders
 from .solving import Solved as Solved
 from .solving import Solver as Solver
 from .tuning import Tuning as Tuning

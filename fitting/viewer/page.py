@@ -23,11 +23,12 @@ from fitting.ground import ground_path
 from fitting.ground.ground_path import GroundPatch
 from fitting.ground.meshes import grid_faces
 from fitting.report.formatting import figures_table, markdown, transposed
+from fitting.report.sliders import Slider, sliders
 from fitting.runtime.precision import in_float64
 from jaxik.world import body
 
 from . import tuning
-from .session import Lines, Session, Slider, sliders
+from .session import Lines, Session
 from .solving import NAMES, SKELETONS, Drawn, Solved, Solver
 from .tuning import Tuning
 

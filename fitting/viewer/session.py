@@ -1,7 +1,6 @@
 """What is viewed: clips on their ground, systems to begin with and to go back to, and a cost."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,16 +27,12 @@ from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.program_cache import cached
 from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
-from jaxik.maths import parameter_tree
-from jaxik.world.body import scaled_declarations
 
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to
 Cost = Callable[[jaxik.FootIK], Float[Array, ""]]
 
 Colour: TypeAlias = tuple[int, int, int]
 """RGB, 0..255."""
-
-STEPS = 400  # of a slider over its range, at least
 
 
 @dataclass(frozen=True)
@@ -235,129 +230,3 @@ def crosses(
 def joined(*parts: Lines) -> Lines:
     """Lines side by side, over the same frames."""
     return Lines(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
-
-
-@dataclass(frozen=True)
-class Slider:
-    """One number or switch of a system, or one element of an array of them."""
-
-    name: str
-    """Dotted, with [i] for an element."""
-    leaf: str
-    """Dotted name of the array."""
-    index: tuple[int, ...]
-    """Of the element; () for a single number."""
-    low: float
-    """In the parameter's unit."""
-    high: float
-    unit: str
-    meaning: str
-    is_switch: bool = False
-    above: str | None = None
-    """Dotted name of the array that the value stays above."""
-    below: tuple[str, ...] = ()
-    """Of those that stay above it."""
-    is_free: bool = False
-    """Whether a fit has changed it."""
-
-    @property
-    def stage(self) -> str:
-        """The stage whose rule has it."""
-        return self.leaf.partition(".")[0]
-
-    @property
-    def label(self) -> str:
-        """The name without its stage."""
-        return self.name.partition(".")[2]
-
-    @property
-    def step(self) -> float:
-        """Of a slider: a round number, in the parameter's unit."""
-        raw = (self.high - self.low) / STEPS
-        power = 10.0 ** math.floor(math.log10(raw))
-        return next(m for m in (5.0, 2.0, 1.0) if m * power <= raw * (1 + 1e-9)) * power
-
-    @property
-    def hint(self) -> str:
-        """What it does, with its unit and range."""
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        limits = "" if self.is_switch else f" {self.low:.4g} to {self.high:.4g}{unit}."
-        return f"{self.name}: {self.meaning}{limits}"
-
-    def read(self, ik: jaxik.FootIK) -> float | bool:
-        """The value that a system has."""
-        value = np.asarray(parameter_tree.get(ik, self.leaf))[self.index]
-        return bool(value) if self.is_switch else float(value)
-
-    def clamped(self, ik: jaxik.FootIK) -> float | bool:
-        """The value moved into the range."""
-        value = self.read(ik)
-        return value if self.is_switch else min(max(value, self.low), self.high)
-
-    @in_float64
-    def write(self, ik: jaxik.FootIK, value: float | bool) -> jaxik.FootIK:
-        """The system with another value, moved to where the order of parameters allows it.
-
-        Raises:
-            ValueError: it is outside the range.
-        """
-        if not self.is_switch:
-            if not self.low - self.step <= value <= self.high + self.step:
-                limits = f"{self.low:g} to {self.high:g}"
-                raise ValueError(f"{self.name} is {value:g}; wanted from {limits}")
-            value = min(max(value, self.low), self.high)  # a page rounds what it sends
-            value = self._in_order(ik, value)
-        leaf = np.array(parameter_tree.get(ik, self.leaf))
-        leaf[self.index] = value
-        return parameter_tree.replace(ik, {self.leaf: leaf})
-
-    def _in_order(self, ik: jaxik.FootIK, value: float) -> float:
-        for leaf in self.below:
-            value = min(value, float(np.min(parameter_tree.get(ik, leaf))))
-        if self.above is not None:
-            value = max(value, float(np.max(parameter_tree.get(ik, self.above))))
-        return value
-
-
-def sliders(
-    ik: jaxik.FootIK, rig: jaxik.Rig | None = None, free: Sequence[FreeParameter] = ()
-) -> list[Slider]:
-    """The parameters and switches of a system, stage by stage.
-
-    Args:
-        ik: the system.
-        rig: on whose body the ranges depend; None is the adult.
-        free: parameters of a fit, whose ranges go before those of their rules.
-    """
-    declared, meanings = scaled_declarations(ik, rig), parameter_tree.docs(ik)
-    fitted = {parameter.leaf: parameter for parameter in free}
-    above = {
-        name: f"{name.rpartition('.')[0]}.{declaration.above}"
-        for name, declaration in declared.items()
-        if declaration.above is not None
-    }
-    every = []
-    for slot in parameter_tree.slots(ik):
-        value = np.asarray(slot.value)
-        declaration, is_switch = declared.get(slot.name), value.dtype == bool
-        if declaration is None and not is_switch:  # a convention, or a mask of layers
-            continue
-        own = fitted.get(slot.name, declaration)
-        low, high = (0.0, 1.0) if own is None else (own.low, own.high)
-        for index in np.ndindex(value.shape):
-            every.append(
-                Slider(
-                    name=slot.name + "".join(f"[{i}]" for i in index),
-                    leaf=slot.name,
-                    index=index,
-                    low=low,
-                    high=high,
-                    unit=slot.unit,
-                    meaning=meanings[slot.name],
-                    is_switch=is_switch,
-                    above=above.get(slot.name),
-                    below=tuple(name for name, other in above.items() if other == slot.name),
-                    is_free=slot.name in fitted,
-                )
-            )
-    return every

@@ -17,11 +17,12 @@ from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress, Report
 from fitting.motion.measures import VISIBLE, Soles
 from fitting.problem.space import free_parameter
+from fitting.report.sliders import sliders
 from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.fit.fit_motions import saved_clips
 from fitting.viewer import Solver, solving, tuning, views
 from fitting.viewer.page import Latest
-from fitting.viewer.session import Lines, sliders
+from fitting.viewer.session import Lines
 from fitting.viewer.solving import IN_GROUND, FootFaults, foot_faults
 from fitting.viewer.tuning import PAUSE, Tuning
 from fitting.viewer.views import Address, FitWatch
