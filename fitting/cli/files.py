@@ -31,7 +31,7 @@ from .terminal import show
 if TYPE_CHECKING:
     from jaxik.record import Reading, Record
 
-LANGUAGES = ("c", "cs")  # of code
+LANGUAGES = ("c", "cs", "js")  # of code
 TEMPLATE = Path()
 """What `--joints` is without a file: no name that a file can have."""
 
@@ -285,6 +285,7 @@ def export(options: argparse.Namespace) -> int:
     jaxik export runs/walk --as c -o walk             the system itself, as C code
     jaxik export runs/walk --as c -o walk --trace walk.bvh --terrain steps.obj
     jaxik export runs/walk --as cs -o walk --axes unity    and in C#, for Unity
+    jaxik export runs/walk --as js -o walk            and as a module of JavaScript
 
     What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
     it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's

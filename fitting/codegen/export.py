@@ -11,7 +11,7 @@ import jaxik
 from fitting.runtime import activity, files
 from jaxik.world.terrain import LegTerrains, Terrain
 
-from . import c_files, cs_files, trace
+from . import c_files, cs_files, js_code, trace
 from .axes import ENGINES
 from .program import Program, build
 
@@ -27,11 +27,14 @@ class Language(NamedTuple):
     """Of a program, the prefix of all names, and the engine whose axes it converts."""
     check: Callable[[Program, str], dict[str, str]]
     """What replays a golden trace."""
+    wide: bool
+    """Whether its floats, and those of the trace, have 64 bits."""
 
 
 LANGUAGES = {
-    "c": Language(c_files.sources, c_files.check),
-    "cs": Language(cs_files.sources, cs_files.check),
+    "c": Language(c_files.sources, c_files.check, wide=False),
+    "cs": Language(cs_files.sources, cs_files.check, wide=False),
+    "js": Language(js_code.sources, js_code.check, wide=True),
 }
 
 
@@ -56,7 +59,8 @@ def export_system(
 ) -> Program:
     """Writes a system in another language.
 
-    "c", `NAME.h` and `NAME.c`, is C99 that is also C++11; "cs", `Name.cs`, is C# 7.2 for Unity.
+    "c", `NAME.h` and `NAME.c`, is C99 that is also C++11; "cs", `Name.cs`, is C# 7.2 for Unity;
+    "js", `NAME.mjs`, is a module of JavaScript for browsers and node, whose floats have 64 bits.
     Its answers are those of `jaxik.step` with hard decisions in 32 bits, but for rounding. The
     engine casts the rays; the comments say how. Parameters stay inputs.
 
@@ -102,7 +106,7 @@ def export_system(
     if golden is not None:
         texts |= LANGUAGES[language].check(program, name)
         with activity.announced("Recording the golden trace"):
-            content = trace.record(program, rig, *golden)
+            content = trace.record(program, rig, *golden, wide=LANGUAGES[language].wide)
         files.write(folder / TRACE, lambda path: path.write_bytes(content))
     for file, text in texts.items():
         files.write_text(folder / file, text)

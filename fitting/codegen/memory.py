@@ -4,7 +4,7 @@ import math
 
 import jax
 import numpy as np
-from jaxtyping import PyTree, UInt32
+from jaxtyping import Float64, PyTree, UInt32
 
 TYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.int32}  # by those of NumPy
 
@@ -25,6 +25,13 @@ def rows(tree: PyTree) -> UInt32[np.ndarray, "structs words"]:
         for leaf in leaves
     ]
     return np.concatenate(parts, axis=1)
+
+
+def doubles(tree: PyTree) -> Float64[np.ndarray, "structs numbers"]:
+    """As `rows`, but each number as a float of 64 bits."""
+    leaves = (np.asarray(leaf) for leaf in jax.tree.leaves(tree))
+    parts = [leaf.reshape(len(leaf), math.prod(leaf.shape[1:])) for leaf in leaves]
+    return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
 def tree_of(rows: UInt32[np.ndarray, "structs words"], like: PyTree) -> PyTree:

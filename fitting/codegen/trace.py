@@ -3,7 +3,8 @@
 # pyright: reportArgumentType=false
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,13 @@ from jaxtyping import PyTree
 import jaxik
 from fitting.runtime.precision import with_floats
 from jaxik.pipeline import step_and_rays
-from jaxik.pipeline.requests import Request
-from jaxik.world.terrain import Hit, LegTerrains, Terrain
+from jaxik.world.terrain import LegTerrains, Terrain
 
-from .memory import rows, words
+from .memory import doubles, rows
 from .program import Program
+
+Pack: TypeAlias = Callable[[PyTree], np.ndarray]
+"""Makes structs, a row each, of a tree whose leaves have one more axis in front."""
 
 
 def with_restart(frames: jaxik.Frame) -> jaxik.Frame:
@@ -28,27 +31,36 @@ def with_restart(frames: jaxik.Frame) -> jaxik.Frame:
 
 
 def record(
-    program: Program, rig: jaxik.Rig, terrain: Terrain | LegTerrains, frames: jaxik.Frame
+    program: Program,
+    rig: jaxik.Rig,
+    terrain: Terrain | LegTerrains,
+    frames: jaxik.Frame,
+    *,
+    wide: bool = False,
 ) -> bytes:
-    """The trace of a clip: parameters and rig, then of each frame all that `check.c` compares.
+    """The trace of a clip: parameters and rig, then of each frame all that a check compares.
 
     Those are the frame, its rays, their hits and the result, as the structs of the program are in
-    memory, with four bytes for each number.
+    memory.
 
     Args:
         program: of the system.
         rig: the legs of the clip.
         terrain: onto which the rays are cast.
         frames: the clip, with the fields of the program's frames.
+        wide: whether JAX computes in 64 bits, and each number is one of them; else in 32.
     """
-    with jax.enable_x64(False):
-        setup = with_floats((program.ik, rig), jnp.float32)
-        trees = with_floats((*setup, terrain, frames), jnp.float32)
-        return words(setup) + b"".join(_frames(program, *trees))
+    with jax.enable_x64(wide):
+        setup = with_floats((program.ik, rig), jnp.float32)  # as they are in the program
+        trees = setup, with_floats((terrain, frames), jnp.float32)
+        (ik, rig), (terrain, frames) = with_floats(trees, jnp.float64) if wide else trees
+        pack = doubles if wide else rows
+        return _struct(pack, (ik, rig)) + b"".join(_frames(program, pack, ik, rig, terrain, frames))
 
 
 def _frames(
     program: Program,
+    pack: Pack,
     ik: jaxik.FootIK,
     rig: jaxik.Rig,
     terrain: Terrain | LegTerrains,
@@ -58,21 +70,14 @@ def _frames(
     for number in range(len(frames.dt)):
         frame = jax.tree.map(lambda leaf, i=number: leaf[i], frames)
         state, result, rays, hits = step_and_rays(ik, rig, terrain, state, frame)
-        yield words(frame) + rays_in_order(program, rays) + hits_in_order(program, hits)
-        yield words(result)
+        yield _struct(pack, frame)
+        for parts in (
+            (rays.origins_ws, -rays.up_ws, rays.length, rays.layers),
+            (hits.point, hits.normal, hits.found, hits.platform),
+        ):
+            yield pack(jax.tree.map(lambda leaf: np.asarray(leaf)[program.order], parts)).tobytes()
+        yield _struct(pack, result)
 
 
-def rays_in_order(program: Program, rays: Request) -> bytes:
-    """Rays as `jaxik.step` casts them, as an array of the program's."""
-    parts = (rays.origins_ws, -rays.up_ws, rays.length, rays.layers)
-    return _in_order(program, parts)
-
-
-def hits_in_order(program: Program, hits: Hit) -> bytes:
-    """Hits of these rays, as an array of the program's."""
-    parts = (hits.point, hits.normal, hits.found, hits.platform)
-    return _in_order(program, parts)
-
-
-def _in_order(program: Program, parts: PyTree) -> bytes:
-    return rows(jax.tree.map(lambda leaf: np.asarray(leaf)[program.order], parts)).tobytes()
+def _struct(pack: Pack, tree: PyTree) -> bytes:
+    return pack(jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)).tobytes()

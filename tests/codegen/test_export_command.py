@@ -8,10 +8,11 @@ import pytest
 from fitting.cli import main
 from fitting.clips import load_clip, save_clip
 from fitting.codegen import toolchain
-from support import mono
+from support import mono, node
 from support.commands import refusal
 from support.experiments import ROOT
 from support.mono import needs_mono
+from support.node import needs_node
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "slope.ply"
@@ -71,6 +72,26 @@ def test_a_trace_of_a_clip_is_replayed_by_a_program_in_csharp(tmp_path, paramete
     assert mono.run(folder, "Check.exe").returncode == 1
 
 
+@pytest.mark.slow
+@needs_node
+def test_a_trace_of_a_clip_is_replayed_by_a_script(tmp_path, parameters):
+    folder, clip = tmp_path / "code", load_clip(BASE)
+    save_clip(tmp_path / "walk.npz", clip.select(slice(0, 5)))
+    words = ["export", parameters, "--as", "js", "-o", folder]
+    words += ["--trace", tmp_path / "walk.npz", "--terrain", GROUND]
+    assert main.main([str(word) for word in words]) == 0
+    assert {path.name for path in folder.iterdir()} == {"footik.mjs", "check.mjs", "trace.bin"}
+    done = node.run(folder, "check.mjs")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("5 frames, largest difference ")
+    module = (folder / "footik.mjs").read_text()
+    assert "/* m/s, 0 to 3: Speed of the character up to" in module
+    damaged = np.fromfile(folder / "trace.bin")
+    damaged[-10] += 0.5  # a number of the last result
+    damaged.tofile(folder / "trace.bin")
+    assert node.run(folder, "check.mjs").returncode == 1
+
+
 def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, parameters):
     main.main(["export", str(parameters), "--as", "c", "-o", str(tmp_path), "--legs", "1"])
     header, code = ((tmp_path / f"footik.{kind}").read_text() for kind in "hc")
@@ -94,6 +115,7 @@ def test_parameters_have_units_ranges_and_meanings_beside_them(tmp_path, paramet
             "name is 'frame'; wanted another one: code in C# has a Frame within",
             marks=pytest.mark.slow,
         ),
+        (["--as", "js", "--axes", "unity"], "axes: only for C and C#"),
         (["--as", "c", "--name", "Walk!"], "name is 'Walk!'; wanted small letters, digits and"),
         (["--as", "c", "--trace", BASE, "--terrain", GROUND, "--legs", "3"], "--legs: a trace has"),
     ],

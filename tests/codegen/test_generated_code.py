@@ -1,4 +1,4 @@
-"""C code of systems: it compiles without a warning, and gives the answers of `jaxik.step`."""
+"""Code of systems: it compiles without a warning, and gives the answers of `jaxik.step`."""
 
 # pyright: reportArgumentType=false
 
@@ -24,6 +24,7 @@ from fitting.codegen import (
     cs_files,
     export,
     header,
+    js_code,
     program,
     stablehlo,
     toolchain,
@@ -37,7 +38,9 @@ from jaxik.pipeline import step_and_rays
 from jaxik.pipeline.requests import Request
 from jaxik.world import terrain
 from jaxik.world.terrain import Hit
+from support import node
 from support.mono import DOUBLES, Mono, needs_mono
+from support.node import needs_node
 
 CLOSE = 1e-5  # m, or of a quaternion
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -131,6 +134,20 @@ def test_generated_csharp_gives_the_answers_of_jaxik_step(tmp_path, walk, hills,
     play = Playback(Mono(system, tmp_path, "footik"), (ik, rig), frames, expected.hits)
     play()
     states, rays, results = play.outputs()
+    assert largest_difference(results, expected.results) < CLOSE
+    assert largest_difference(states, expected.states) < CLOSE
+    assert largest_difference(rays, expected.rays) < CLOSE
+
+
+@needs_node
+def test_generated_javascript_gives_the_answers_of_jaxik_step(tmp_path, walk, hills, unreal):
+    rig, frames = walk
+    ik, expected = unreal
+    frame = jax.tree.map(lambda leaf: leaf[0], frames)
+    system = export.export_system(ik, rig, tmp_path, language="js", terrain=hills, frame=frame)
+    states, rays, results = node.played(
+        system, tmp_path, "footik", (ik, rig), frames, expected.hits
+    )
     assert largest_difference(results, expected.results) < CLOSE
     assert largest_difference(states, expected.states) < CLOSE
     assert largest_difference(rays, expected.rays) < CLOSE
@@ -269,12 +286,18 @@ def operands():
 SMALLEST = 1.2e-38  # below, XLA takes numbers for 0
 
 
-def differing(ours: Outcomes, theirs: Outcomes) -> dict[str, Any]:
-    """What differs, by operation: how often, and the first place."""
+def differing(ours: Outcomes, theirs: Outcomes, exact: float = SMALLEST) -> dict[str, Any]:
+    """What differs, by operation: how often, and the first place.
+
+    Args:
+        ours: of the code.
+        theirs: of JAX.
+        exact: by which fraction operations may differ that every processor rounds alike.
+    """
     wrong = {}
     for name, b in (theirs.exact | theirs.rounded).items():
         a = (ours.exact | ours.rounded)[name]
-        rounding = 3e-6 if name in theirs.rounded else SMALLEST
+        rounding = 3e-6 if name in theirs.rounded else exact
         same = np.isclose(a, b, rtol=rounding, atol=rounding, equal_nan=True)
         if not same.all():
             wrong[name] = (
@@ -297,7 +320,7 @@ def operations(operands, walk) -> program.Program:
 @pytest.fixture
 def no_routines(monkeypatch):
     """As of frames that are rows of operands."""
-    for module in (c_code, cs_code, header):
+    for module in (c_code, cs_code, header, js_code):
         monkeypatch.setattr(module, "routines", lambda program: [])
 
 
@@ -333,6 +356,19 @@ def test_every_operation_in_csharp_gives_the_answers_of_jax(
     assert differing(results, expected) == {}
 
 
+@needs_node
+@pytest.mark.usefixtures("no_routines")
+def test_every_operation_in_javascript_gives_the_answers_of_jax(
+    tmp_path, walk, operands, operations
+):
+    rows, expected = operands
+    for file, text in js_code.sources(operations, "rules").items():
+        (tmp_path / file).write_text(text)
+    hits = Hit(*(jnp.zeros((len(rows.x), 0, *size), jnp.float32) for size in ((3,), (3,), (), ())))
+    outputs = node.played(operations, tmp_path, "rules", (operations.ik, walk[0]), rows, hits)
+    assert differing(outputs.results, expected, exact=1e-6) == {}
+
+
 def test_every_rule_is_among_those_operations(operations):
     with jax.enable_x64(False):
         text = program.exported(operated, (operations.trees["frame"],)).mlir_module()
@@ -346,7 +382,7 @@ def test_every_rule_is_among_those_operations(operations):
         for name, operands in zip(graph.operations, graph.operands, strict=True)
         if operands
     }
-    for language in (c_code, cs_code):
+    for language in (c_code, cs_code, js_code):
         assert set(language.EXPRESSIONS) - used == set(), language
 
 

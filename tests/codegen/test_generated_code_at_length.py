@@ -23,6 +23,7 @@ from jaxik.pipeline import step_and_rays
 from jaxik.world import terrain
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Hit
+from support import node
 from support.clips import make_rig, to_frames, to_rig, wandering
 from support.mono import DOUBLES, Mono
 
@@ -37,6 +38,7 @@ BUILDS = {
     "C#": ("mono",),
     "C#, in doubles": ("mono", DOUBLES),
 }
+NODE = ("node",)
 BUGS = (np.nan, np.inf, -np.inf, 3e38)
 DENORMAL = 1e-42  # which JAX takes for 0
 ROUNDINGS = 8
@@ -94,15 +96,18 @@ def recorded(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Any, frames: jaxik.Frame)
     return jax.lax.scan(advance, jaxik.init(ik, rig), frames)[1]
 
 
-def make_case(name: str, legs: int, count: int, bugs: int = 0, ground: Any = None) -> Case:
+def make_case(
+    name: str, legs: int, count: int, bugs: int = 0, ground: Any = None, dtype: Any = jnp.float32
+) -> Case:
     """A preset on hills, or on another ground."""
     frames, rig = frames_of(legs, count, bugs), to_rig(make_rig(legs=min(legs, 2)))
     if legs > 2:
         rig = workloads.with_legs(rig, frames, legs)[0]
-    with jax.enable_x64(False):
+    with jax.enable_x64(dtype == jnp.float64):
+        ground = single(hills() if ground is None else ground)
         frames, rig = single(frames), single(rig)
-        ground = hills() if ground is None else ground
         ik = single(getattr(jaxik.presets, name)(rig))
+        ik, rig, ground, frames = with_floats((ik, rig, ground, frames), dtype)
         states, results, hits = jax.device_get(recorded(ik, rig, ground, frames))
         fresh = jax.device_get(jaxik.init(ik, rig))
     starts = jax.tree.map(lambda a, b: np.concatenate([a[None], b[:-1]]), fresh, states)
@@ -161,18 +166,36 @@ def first_of(frames: jaxik.Frame) -> jaxik.Frame:
 
 
 def played(case: Case, folder: Any, command: tuple[str, ...], *, chained: bool) -> Outputs:
-    program = export.export_system(
-        case.ik, case.rig, folder, language="cs" if command[0] == "mono" else "c",
+    languages = {"mono": "cs", "node": "js"}
+    system = export.export_system(
+        case.ik, case.rig, folder, language=languages.get(command[0], "c"),
         terrain=case.ground, frame=first_of(case.frames),
     )  # fmt: skip
+    setup, starts = (case.ik, case.rig), None if chained else case.starts
+    if command == NODE:
+        return node.played(system, folder, "footik", setup, case.frames, case.hits, starts)
     if command[0] == "mono":
-        compiled = Mono(program, folder, "footik", *command[1:])
+        compiled = Mono(system, folder, "footik", *command[1:])
     else:
-        compiled = Compiled(program, folder, "footik", command)
-    starts = None if chained else case.starts
-    play = Playback(compiled, (case.ik, case.rig), case.frames, case.hits, starts)
+        compiled = Compiled(system, folder, "footik", command)
+    play = Playback(compiled, setup, case.frames, case.hits, starts)
     play()
     return play.outputs()
+
+
+def assert_agreement_in_64_bits(case: Case, folder: Any) -> None:
+    """As `assert_agreement`, for JavaScript: its floats have 64 bits, as those of the case."""
+    if node.NODE is None:
+        pytest.skip("needs node, which is not installed")
+    alone, chain = (played(case, folder, NODE, chained=chained) for chained in (False, True))
+    np.testing.assert_array_equal(alone.results.faulty, case.results.faulty)
+    # A target at the very end of a leg may be reached or not: nothing depends on it.
+    turned = np.any(alone.results.reached != case.results.reached, axis=1)
+    assert turned.mean() <= PARTED
+    same = dataclasses.replace(alone.results, reached=case.results.reached)
+    assert differences(same, case.results).max() <= CLOSE
+    same = dataclasses.replace(chain.results, reached=case.results.reached)
+    assert np.mean(differences(same, case.results) > CLOSE) < PARTED
 
 
 def assert_agreement(case: Case, folder: Any, command: tuple[str, ...]) -> None:
@@ -200,6 +223,12 @@ def test_ten_thousand_frames_of_a_preset_are_those_of_jax(name, tmp_path):
             assert_agreement(case, tmp_path, command)
 
 
+@pytest.mark.parametrize("name", ["record", "stride", "ozz", "mec", "unreal"])
+def test_frames_of_a_preset_in_javascript_are_those_of_jax(name, tmp_path):
+    case = make_case(name, 2, 1_000, 4, dtype=jnp.float64)
+    assert_agreement_in_64_bits(case, tmp_path)
+
+
 @pytest.mark.parametrize("build", ["gcc", "C#"])
 @pytest.mark.parametrize("legs", [1, 4, 8])
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
@@ -207,18 +236,32 @@ def test_rigs_of_other_legs_are_those_of_jax(name, legs, build, tmp_path):
     assert_agreement(make_case(name, legs, 500, bugs=2), tmp_path, BUILDS[build])
 
 
+@pytest.mark.parametrize("legs", [1, 4, 8])
+def test_rigs_of_other_legs_in_javascript_are_those_of_jax(legs, tmp_path):
+    case = make_case("mec", legs, 500, 2, dtype=jnp.float64)
+    assert_agreement_in_64_bits(case, tmp_path)
+
+
 @pytest.mark.parametrize("build", ["gcc", "C#"])
 @pytest.mark.parametrize("name", ["record", "mec"])
 def test_platforms_and_ups_of_legs_are_those_of_jax(name, build, tmp_path):
-    still, moving = hills(), terrain.moving(terrain.plane((0.0, 0.05, 0.0), (0.1, 1.0, 0.0)), 0)
-    side = terrain.plane((0.6, 0.0, 0.0), up=(0.3, 1.0, -0.1))
-    ground = single(terrain.LegTerrains(still, (terrain.combine(still, moving), side)))
-    case = make_case_on_platform(name, ground)
+    case = make_case_on_platform(name, platforms_and_side())
     assert {-1, 0} <= set(case.hits.platform.ravel().tolist())
     assert_agreement(case, tmp_path, BUILDS[build])
 
 
-def make_case_on_platform(name: str, ground: Any) -> Case:
+def test_platforms_and_ups_of_legs_in_javascript_are_those_of_jax(tmp_path):
+    case = make_case_on_platform("mec", platforms_and_side(), jnp.float64)
+    assert_agreement_in_64_bits(case, tmp_path)
+
+
+def platforms_and_side() -> terrain.LegTerrains:
+    still, moving = hills(), terrain.moving(terrain.plane((0.0, 0.05, 0.0), (0.1, 1.0, 0.0)), 0)
+    side = terrain.plane((0.6, 0.0, 0.0), up=(0.3, 1.0, -0.1))
+    return terrain.LegTerrains(still, (terrain.combine(still, moving), side))
+
+
+def make_case_on_platform(name: str, ground: Any, dtype: Any = jnp.float32) -> Case:
     """As `make_case`, with a platform that rises and turns."""
     count, time = 500, np.arange(500) / 30.0
     pos = np.stack([0.1 * time, 0.04 * np.sin(3.0 * time), 0.0 * time], -1)
@@ -227,7 +270,7 @@ def make_case_on_platform(name: str, ground: Any) -> Case:
     frames = frames_of(2, count, 1).with_platforms(tracks)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{__name__}.frames_of", lambda *_: jax.tree.map(np.asarray, frames))
-        return make_case(name, 2, count, 0, ground)
+        return make_case(name, 2, count, 0, ground, dtype)
 
 
 @pytest.mark.parametrize("name", ["record", "stride", "mec"])
