@@ -312,8 +312,12 @@ def _name(key: Any) -> str:
 
 
 def exported(function: Callable, trees: tuple) -> export.Exported:
-    """A function in StableHLO, of all leaves of these arguments or shapes."""
-    return export.export(jax.jit(function, keep_unused=True))(*trees)
+    """A function in StableHLO, of all leaves of these arguments or shapes.
+
+    Of arguments only the shapes count: arrays that are committed to a device would bring it along.
+    """
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), trees)
+    return export.export(jax.jit(function, keep_unused=True))(*shapes)
 
 
 def _blank_hits(shape: tuple[int, ...], platforms: int) -> Hit:
