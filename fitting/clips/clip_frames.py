@@ -244,12 +244,12 @@ def clip_from_result(
     for joint, turn_ms, share in turns:
         if joint is not None and turn_ms is not None:
             turn_ws = upright * rotation(turn_ms) ** share * upright.inv()
-            above = _with_descendants(joint, clip.parents)
+            above = with_descendants(joint, clip.parents)
             _turn(turn_ws, positions_ws, rotations_ws, above)
     return clip.with_motion(positions_ws, rotations_ws)
 
 
-def _with_descendants(joint: int, parents: Sequence[int]) -> list[int]:
+def with_descendants(joint: int, parents: Sequence[int]) -> list[int]:
     """A joint and all below it in the tree, itself first."""
     joints = [joint]
     for child, parent in enumerate(parents):

@@ -18,7 +18,8 @@ from fitting.ground.ground_path import GroundPatch
 from fitting.motion.measures import PlacedMotion
 from jaxik.world import body
 
-from . import style
+from . import live_data, style
+from .live_data import LiveClip
 
 MAX_RATE = 60.0  # frames per second that are shown
 MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 adds a third
@@ -67,6 +68,8 @@ class ViewedClip:
     ground: GroundPatch
     watched: str
     """Key of the motion that is watched at first."""
+    live: LiveClip | None = None
+    """With which the page solves the clip again; None for one that stays as it is."""
 
     @property
     def reference(self) -> PlacedMotion:
@@ -82,12 +85,11 @@ def pack(clips: Sequence[ViewedClip], spent: int = 0) -> list[dict[str, Any]]:
         spent: bytes of the page's pictures.
     """
     grounds = coarse_grounds([clip.ground for clip in clips])
-    room = MAX_BYTES - spent - sum(map(_ground_bytes, grounds))
+    corners = [_corner(*pair) for pair in zip(clips, grounds, strict=True)]
+    lives, spent_on_lives = live_data.pack([clip.live for clip in clips], corners)
+    room = MAX_BYTES - spent - spent_on_lives - sum(map(_ground_bytes, grounds))
     steps = steps_between_frames(clips, room)
-    return [
-        _pack_clip(clip, ground, step)
-        for clip, ground, step in zip(clips, grounds, steps, strict=True)
-    ]
+    return [_pack_clip(*each) for each in zip(clips, grounds, corners, lives, steps, strict=True)]
 
 
 def steps_between_frames(clips: Sequence[ViewedClip], room: int = MAX_BYTES) -> list[int]:
@@ -122,9 +124,19 @@ def _motion_bytes(motion: PlacedMotion) -> int:
     return 2 * _points(motion).size + frames * (12 + legs)
 
 
-def _pack_clip(clip: ViewedClip, ground: GroundPatch, step: int) -> dict[str, Any]:
+def _corner(clip: ViewedClip, ground: GroundPatch) -> np.ndarray:
+    """What places of a clip are relative to, m."""
+    return np.append(ground.corner, _lowest(ground, clip.reference))[[0, 2, 1]]
+
+
+def _pack_clip(
+    clip: ViewedClip,
+    ground: GroundPatch,
+    corner: np.ndarray,
+    live: dict[str, Any] | None,
+    step: int,
+) -> dict[str, Any]:
     reference = clip.reference.clip
-    corner = np.append(ground.corner, _lowest(ground, clip.reference))[[0, 2, 1]]
     return {
         "rate": reference.fps / step,
         "frames": len(range(0, reference.frame_count, step)),
@@ -142,6 +154,7 @@ def _pack_clip(clip: ViewedClip, ground: GroundPatch, step: int) -> dict[str, An
             for key, viewed in clip.motions.items()
         ],
         "ground": _pack_ground(ground, corner),
+        "live": live and live | {"step": step},
     }
 
 

@@ -31,6 +31,7 @@ VIEWER_SCRIPTS = (  # in the order in which they use each other
     "camera.js",
     "timeline.js",
     "player.js",
+    "live.js",
 )
 COLOURS = {  # of the plots, as variables of the style sheet
     "captured": style.CAPTURED,
@@ -55,6 +56,7 @@ def render(clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
     return template.render(
         **content,
         data=as_json({"clips": clips}),
+        is_live=any(clip.get("live") for clip in clips),
         colours=COLOURS,
         version=metadata.version("jaxik"),
         style=Markup(_assets(STYLES)),

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, FigureBase
 import jaxik
 from fitting.clips import flight
 from fitting.experiment.parameter_files import load_system
-from fitting.experiment.systems import preset_system
+from fitting.experiment.systems import preset_system, without_own_root
 from fitting.ground import ground_path
 from fitting.motion import accuracy
 from fitting.motion.accuracy import Accuracy
@@ -44,12 +44,15 @@ from fitting.report.document import (
     View,
 )
 from fitting.report.formatting import Table, figures_table, listed, meanings, percent, transposed
+from fitting.report.live_data import LiveClip, LiveSystem
 from fitting.report.motion_data import MAX_RATE, Appearance, ViewedClip, ViewedMotion
+from fitting.report.sliders import sliders
 from fitting.report.style import BEFORE, CAPTURED, STAGES
 from fitting.runtime import activity
 from fitting.runtime.display import Displayable, data_frame
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
+from jaxik.world.terrain import moving
 
 from . import animations
 from .animations import JOINTS, Animation, RateDifference
@@ -97,6 +100,8 @@ class Comparison(Displayable):
     """The errors of systems that gave no motion, by name."""
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
+    solved_by: Mapping[str, jaxik.FootIK] = field(default_factory=dict)
+    """The systems as they ran, by name."""
 
     @property
     def animated(self) -> PlacedMotion:
@@ -235,6 +240,8 @@ def run_systems(
         for name, ik in systems.items():
             with error_context(name):
                 animation.check_shapes(ik)
+    if animation.root.rise is not None:
+        systems = {name: without_own_root(ik) for name, ik in systems.items()}
     solved, failures = {}, {}
     for name, ik in systems.items():
         try:
@@ -249,7 +256,8 @@ def run_systems(
         motions = {ANIMATED: animation.place(animation.placed_clip)}
         motions |= {name: animation.place(clip, result) for name, (result, clip) in solved.items()}
         causes = {name: animation.cause(motions[name]) for name in solved}
-    return Comparison(title, animation, motions, causes, failures)
+    solved_by = {name: systems[name] for name in solved}
+    return Comparison(title, animation, motions, causes, failures, solved_by=solved_by)
 
 
 def worst_seconds(feet: Soles, fps: float) -> tuple[int, int]:
@@ -474,7 +482,7 @@ def document(comparison: Comparison) -> Document:
         setup=_setup(comparison),
         numbers={NUMBERS: numbers(comparison)},
         view=View(
-            [viewed_clip(comparison, systems, watched=_worst_system(comparison))],
+            [viewed_clip(comparison, systems, _worst_system(comparison), live_clip(comparison))],
             [comparison.title],
             f"{100 * visible:.2g} cm",
         ),
@@ -642,13 +650,39 @@ def _reach(comparison: Comparison) -> Finding:
     return Finding(f"{text}; {unknown}.")
 
 
-def viewed_clip(comparison: Comparison, systems: tuple[str, ...], watched: str) -> ViewedClip:
+def live_clip(comparison: Comparison) -> LiveClip:
+    """The clip as the page solves it again, with each system."""
+    animation, rig = comparison.animation, comparison.animation.clip.rig
+    carried = animation.carried is not None
+    return LiveClip(
+        animated=comparison.animated.clip,
+        frames=animation.frames,
+        rig=rig,
+        terrain=moving(animation.terrain, 0) if carried else animation.terrain,
+        observed=animation.clip.observed,
+        visible=comparison.animated.measures.visible,
+        systems={
+            key(name): LiveSystem({"compared": ik}, sliders(ik, rig))
+            for name, ik in comparison.solved_by.items()
+        },
+        captured="" if comparison.captured is None else CAPTURE,
+        has_tracks=bool(animation.tracks),
+    )
+
+
+def viewed_clip(
+    comparison: Comparison,
+    systems: tuple[str, ...],
+    watched: str,
+    live: LiveClip | None = None,
+) -> ViewedClip:
     """What the view shows: colours are those of the plots.
 
     Args:
         comparison: with the motions.
         systems: names of all systems, which decide the colours.
         watched: the one that is watched at first, if it gave a motion.
+        live: with which the page solves the clip again, if it is to.
     """
     flat = motion_data.ANIMATED._replace(colour=BEFORE)
     appearances = {ANIMATED: flat} | {
@@ -677,6 +711,7 @@ def viewed_clip(comparison: Comparison, systems: tuple[str, ...], watched: str) 
         comparison.animated.clip.stance_labels(),
         ground_path.around_path(highest, comparison.animation.terrain),
         watched=key(watched if watched in comparison.motions else ANIMATED),
+        live=live,
     )
 
 

@@ -1,15 +1,23 @@
 """Pages in a browser: they open from disk, draw, play, and fit a phone."""
 
+import base64
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import jaxik
+from fitting.motion import measures, playback
 from fitting.report import pages
 from fitting.studies import comparison
+from fitting.studies.fit import fit_motions
+from fitting.studies.fit.fit import Fit
 from fitting.studies.sample import run_comparison
 from fitting.studies.sample.run_comparison import ComparedRun
+from jaxik.maths import parameter_tree
 from support import comparisons, runs
 from support.browsers import launch, needs_chromium
 from support.pages import Page
@@ -23,6 +31,7 @@ RUNS = [
     ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}),
     ComparedRun("b", -15.0, 2.0, 5.0, 1.0, 4.0, 2, {1: -15.0}),
 ]
+OWN = ("data:", "blob:")  # what a page has made by itself
 PHONE = {"width": 390, "height": 844}
 DESKTOP = {"width": 1280, "height": 900}
 
@@ -33,9 +42,14 @@ pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("run")
-    runs.write_run(folder, runs.with_clips(runs.invented_fit(folder)))
+def fitted(tmp_path_factory) -> Fit:
+    return runs.with_clips(runs.invented_fit(tmp_path_factory.mktemp("run")))
+
+
+@pytest.fixture(scope="module")
+def path(fitted) -> Path:
+    folder = fitted.experiment.path.parent
+    runs.write_run(folder, fitted)
     return folder / pages.PAGE
 
 
@@ -88,7 +102,7 @@ def open_page(browser, path) -> Iterator[Callable[..., Any]]:
     for context in contexts:
         context.close()
     loaded = {page.as_uri() for page in opened_pages}
-    own = [event for event in events if event not in loaded and not event.startswith("data:")]
+    own = [event for event in events if event not in loaded and not event.startswith(OWN)]
     assert own == []
 
 
@@ -223,5 +237,106 @@ def test_without_webgl_the_rest_can_be_read(browser, path):
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(path.as_uri())
     assert page.locator("#failure").is_visible()
-    assert page.locator("#parameters-heading").is_visible()
+    assert page.get_by_role("heading", name="Parameters", exact=True).is_visible()
+    assert page.locator("#live").is_hidden()
     page.close()
+
+
+# Live parameters
+
+
+SOLVED = """(() => {
+  const solution = document.getElementById("live").solution;
+  if (!solution || !solution.parameters.includes(VALUE)) return null;
+  const names = ["points", "parameters", "inGround"];
+  return Object.fromEntries(names.map((name) => [name, Array.from(solution[name])]));
+})()"""
+
+
+def solution(page: Any, value: float) -> dict[str, list[float]]:
+    """What the page has solved with parameters among which there is this value."""
+    solved = SOLVED.replace("VALUE", repr(value))
+    page.wait_for_function(solved)
+    return page.evaluate(solved)
+
+
+def shown_by_jaxik(fitted: Fit, data: dict[str, Any], ik: jaxik.FootIK) -> np.ndarray:
+    """Joints and soles of a system's motion, relative to the corner of the page, m."""
+    (clip,), (scene,) = fitted.clips, fitted.scenes
+    solved = fit_motions.fitted_clip(clip, playback.run(ik, scene))
+    captured = data["skeletons"][2]
+    start = np.frombuffer(base64.b64decode(captured["root"]), "<f4")[:3]
+    corner = clip.reference.positions_ws[0, captured["pelvis"]] - start
+    soles = measures.sole_points(solved).reshape(len(solved.positions_ws), -1, 3)
+    return np.concatenate([solved.positions_ws, soles], axis=1) - corner
+
+
+def test_the_page_solves_a_clip_as_jaxik_run_does(open_page, fitted, path):
+    page, (data,) = open_page(), Page(path).data["clips"]
+    assert page.locator("#live-status").is_hidden()
+    page.locator("#live > summary").click()
+    unchanged = solution(page, float(fitted.ik.foot.max_pitch))
+    frames, skeleton = data["frames"], data["skeletons"][3]
+    ours = np.reshape(unchanged["points"], (frames, -1, 3))
+    np.testing.assert_allclose(ours, shown_by_jaxik(fitted, data, fitted.ik), atol=1e-4)
+    assert unchanged["inGround"] == list(base64.b64decode(skeleton["inGround"]))
+    before, sliders = shown(page)["ankles"], page.locator("#live-sliders")
+    sliders.get_by_label("foot.max_pitch", exact=True).fill("0.3")
+    sliders.get_by_text("leg", exact=True).click()
+    sliders.get_by_label("leg.weight", exact=True).fill("0.61")
+    changed = solution(page, 0.61)
+    moved = {"foot.max_pitch": 0.3, "leg.weight": 0.61}
+    expected = shown_by_jaxik(fitted, data, parameter_tree.replace(fitted.ik, moved))
+    assert np.abs(expected - ours).max() > 0.01
+    ours = np.reshape(changed["points"], (frames, -1, 3))
+    np.testing.assert_allclose(ours, expected, atol=1e-4)
+    assert page.locator("#legend").inner_text().endswith("fitted, live")
+    assert shown(page)["ankles"] != before
+    status = page.locator("#live-status").inner_text()
+    print(status)  # with the time that it took
+    assert re.fullmatch(
+        r"Live: “fitted” solved by this page in \d+ ms\. "
+        r"Ankles \d+\.\d\d cm from captured \(rms\); as fitted \d+\.\d\d cm\.", status
+    )  # fmt: skip
+    changes = page.locator("#live-changes").inner_text()
+    assert changes == "foot.max_pitch = 0.3\nleg.weight = 0.61"
+    page.get_by_role("button", name="fitted", exact=True).click()
+    page.wait_for_function("!document.getElementById('legend').textContent.includes('live')")
+    assert shown(page)["ankles"] == before and page.locator("#live-changes").is_hidden()
+
+
+@pytest.mark.slow
+def test_a_comparison_solves_the_clip_with_the_system_that_is_watched(open_page, tmp_path):
+    systems = comparison.named_systems([("--presets", "record,stride,mec,unreal")])
+    compared = comparison.run_systems(systems, comparisons.walk(2.5))
+    comparison.document(compared).write(tmp_path)
+    page, (data,) = open_page(path=tmp_path / pages.PAGE), Page(tmp_path / pages.PAGE).data["clips"]
+    page.locator("#live > summary").click()
+    for name in systems:
+        page.evaluate("document.getElementById('live').solution = null")
+        page.locator("#watched").select_option(f"motion {name}")
+        page.wait_for_function("document.getElementById('live-status').textContent.includes('cm')")
+        assert page.locator("#live-system").input_value() == f"motion {name}"
+        solved = solution(page, 1.0)
+        (skeleton,) = [each for each in data["skeletons"] if each["key"] == f"motion {name}"]
+        root = np.frombuffer(base64.b64decode(skeleton["root"]), "<f4").reshape(-1, 1, 3)
+        offsets = np.frombuffer(base64.b64decode(skeleton["offsets"]), "<i2")
+        stored = root + skeleton["quantum"] * offsets.reshape(data["frames"], -1, 3)
+        ours = np.reshape(solved["points"], stored.shape)
+        np.testing.assert_allclose(ours, stored, atol=1e-4, err_msg=name)
+        assert solved["inGround"] == list(base64.b64decode(skeleton["inGround"])), name
+
+
+def test_parameters_are_changed_by_keyboard_on_a_phone(open_page):
+    page = open_page(PHONE, color_scheme="dark")
+    page.locator("#live > summary").focus()
+    page.keyboard.press("Enter")
+    slider = page.locator("#live-sliders").get_by_label("foot.max_pitch", exact=True)
+    slider.focus()
+    value = float(slider.input_value())
+    page.keyboard.press("ArrowRight")
+    assert float(slider.input_value()) > value
+    assert slider.get_attribute("aria-valuetext").endswith(" rad")
+    page.wait_for_function("document.getElementById('legend').textContent.includes('live')")
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
+    assert page.locator("#view").is_visible()

@@ -2,7 +2,7 @@
 
 function showFailure() {
   element("failure").hidden = false;
-  for (const part of document.querySelectorAll(".controls, .options, .to-worst")) part.hidden = true;
+  for (const part of document.querySelectorAll(".controls, .options, .live, .to-worst")) part.hidden = true;
 }
 
 // What draws, or null where the browser cannot.
@@ -47,6 +47,7 @@ class Player {
     this.play(false);
     this.camera.setClip(this.clip, ...this.watched.reach());
     this.camera.follow(this.pelvis());
+    this.live?.setClip();
   }
 
   // What the marks over the slider, the red feet's label, the shadow and the camera belong to.
@@ -61,12 +62,13 @@ class Player {
     for (const box of element("legend").querySelectorAll("input")) box.checked = this.shown.has(box.dataset.key);
     this.timeline.setClip(this.clip, this.watched);
     this.timeline.point(this.time);
+    this.live?.watch(this.watched.key);
     this.request();
   }
 
   makeLegend() {
     element("legend").replaceChildren();
-    for (const { key, label, colour } of this.skeletons) {
+    for (const { key, label, colour, solution } of this.skeletons) {
       const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: this.shown.has(key) });
       box.dataset.key = key;
       box.addEventListener("change", () => {
@@ -77,7 +79,7 @@ class Player {
       swatch.className = "swatch";
       swatch.style.background = colour;
       const entry = document.createElement("label");
-      entry.append(box, swatch, label);
+      entry.append(box, swatch, solution ? `${label}, live` : label);
       element("legend").append(entry);
     }
   }
@@ -145,6 +147,17 @@ class Player {
     element("clock").textContent = `${seconds.toFixed(2)} / ${all.toFixed(2)} s`;
     for (const skeleton of this.skeletons) skeleton.pose(time);
     this.timeline.point(time);
+    this.request();
+  }
+
+  // Draws another motion of a skeleton, or its own again.
+  show(skeleton, solution) {
+    const isNew = !skeleton.solution !== !solution;
+    skeleton.show(solution);
+    if (isNew) this.makeLegend();
+    skeleton.pose(this.time);
+    this.timeline.drawAll();
+    this.timeline.point(this.time);
     this.request();
   }
 

@@ -11,11 +11,25 @@ class Skeleton {
     Object.assign(this, packed);
     this.root = new Float32Array(bytesOf(packed.root));
     this.offsets = new Int16Array(bytesOf(packed.offsets));
-    this.inGround = new Uint8Array(bytesOf(packed.inGround));
+    this.packedMarks = new Uint8Array(bytesOf(packed.inGround));
+    this.show(null);
     this.footBones = new Map(); // leg by bone, "parent-child"
     packed.legs.forEach((joints, leg) => this.footBones.set(`${joints[2]}-${joints[3]}`, leg));
     this.legCount = legs;
     this.positions = new Float32Array(3 * packed.points);
+  }
+
+  // Another motion of this skeleton, `points` in each frame and feet `inGround`; null is its own.
+  show(solution) {
+    this.solution = solution;
+    this.inGround = solution ? solution.inGround : this.packedMarks;
+  }
+
+  // A coordinate of a point in a frame, m; `i` is the point's number times 3, plus that of the axis.
+  at(frame, i) {
+    const place = 3 * this.points * frame + i;
+    if (this.solution) return this.solution.points[place];
+    return this.root[3 * frame + (i % 3)] + this.quantum * this.offsets[place];
   }
 
   // All points at a time in frames, linear between two, in `positions`; m.
@@ -26,10 +40,8 @@ class Skeleton {
     const part = time - first;
     const count = 3 * this.points;
     for (let i = 0; i < count; i++) {
-      const axis = i % 3;
-      const a = this.root[3 * first + axis] + this.quantum * this.offsets[count * first + i];
-      const b = this.root[3 * second + axis] + this.quantum * this.offsets[count * second + i];
-      this.positions[i] = a + part * (b - a);
+      const a = this.at(first, i);
+      this.positions[i] = a + part * (this.at(second, i) - a);
     }
     return this.positions;
   }

@@ -19,16 +19,21 @@ from jaxtyping import Bool
 import jaxik
 from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result, raised
+from fitting.experiment import systems
 from fitting.experiment.problems import ClipData
 from fitting.ground import ground_path
 from fitting.ground.ground_path import GroundPatch
 from fitting.motion import accuracy, playback
 from fitting.motion.accuracy import Accuracy, Errors
 from fitting.motion.measures import PlacedMotion, place, with_soles_of
-from fitting.problem.capture_system import system_and_scenes
+from fitting.problem.capture_system import alone, is_of_capture, system_and_scenes
 from fitting.problem.problem import Problem
+from fitting.problem.scene import own_system
+from fitting.report import live_data
+from fitting.report.live_data import LiveClip, LiveSystem
+from fitting.report.sliders import sliders
 from fitting.runtime import activity
-from fitting.runtime.precision import in_float64
+from fitting.runtime.precision import in_float64, with_floats
 
 from .fit import Fit
 
@@ -74,6 +79,33 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
             name: accuracy.clip_errors(clip, data.reference, animated)
             for name, clip in solved.items()
         },
+    )
+
+
+@in_float64
+def live_clip(fitted: Fit, number: int, motions: ClipMotions) -> LiveClip:
+    """One clip of a fit, by its number, as its page solves it again."""
+    scene, experiment, space = fitted.scenes[number], fitted.experiment, fitted.problem.space
+    preset = with_floats(experiment.preset_system(fitted.clips[0].base.rig), np.float64)
+    if any(clip.root.rise is not None for clip in fitted.clips):
+        preset = systems.without_own_root(preset)
+    starts = {"fitted": fitted.ik, "before the fit": alone(space.system), "preset": preset}
+    free = [parameter for parameter in space.parameters if not is_of_capture(parameter.name)]
+    own = sliders(fitted.ik, fitted.clips[0].base.rig, free)
+    if scene.size is not None:
+        own = [slider.scaled(float(scene.size)) for slider in own]
+    return LiveClip(
+        animated=motions.animated.clip,
+        frames=scene.frames,
+        rig=scene.rig,
+        terrain=scene.terrain,
+        observed=fitted.clips[number].base.observed,
+        visible=motions.fitted.measures.visible,
+        systems={
+            "fitted": LiveSystem({name: own_system(ik, scene) for name, ik in starts.items()}, own)
+        },
+        captured="captured",
+        has_tracks=bool(scene.tracks),
     )
 
 
@@ -128,4 +160,6 @@ def _play(problem: Problem[jaxik.FootIK]) -> tuple[jaxik.Result, ...]:
     for scene, result in zip(scenes, results, strict=True):
         playback.play(scene, result)
     playback.measure_activity(system, scenes, results)
+    for scene in scenes:
+        live_data.prepare(system, scene)
     return results

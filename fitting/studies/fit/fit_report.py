@@ -33,6 +33,7 @@ from fitting.report.document import (
     View,
 )
 from fitting.report.formatting import Table, figures_table, listed, percent
+from fitting.report.live_data import LiveClip
 from fitting.report.motion_data import ViewedClip, ViewedMotion
 from fitting.runtime import activity
 from fitting.runtime.beside import calls_beside
@@ -153,8 +154,9 @@ def fit_document(
 def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     windows = map(worst_window.find_worst_window, fitted.playbacks)
     labels = [scene.reference.label for scene in fitted.problem.data]
+    lives = (fit_motions.live_clip(fitted, number, clip) for number, clip in enumerate(motions))
     return View(
-        [viewed_clip(*each) for each in zip(motions, labels, windows, strict=True)],
+        [viewed_clip(*each) for each in zip(motions, labels, windows, lives, strict=True)],
         [entry.reference.name for entry in fitted.experiment.clips],
         f"{100 * motions[0].fitted.measures.visible:.2g} cm",
         stands="captured",
@@ -162,7 +164,9 @@ def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     )
 
 
-def viewed_clip(clip: ClipMotions, label: str, window: WorstWindow) -> ViewedClip:
+def viewed_clip(
+    clip: ClipMotions, label: str, window: WorstWindow, live: LiveClip | None = None
+) -> ViewedClip:
     """What the page shows of one clip; `label` is what it calls the captured motion."""
     worst = window.start, window.end
     return ViewedClip(
@@ -175,6 +179,7 @@ def viewed_clip(clip: ClipMotions, label: str, window: WorstWindow) -> ViewedCli
         clip.stance,
         clip.ground,
         watched="fitted",
+        live=live,
     )
 
 
