@@ -298,6 +298,9 @@ def test_the_page_solves_a_clip_as_jaxik_run_does(open_page, fitted, path):
         r"Live: “fitted” solved by this page in \d+ ms\. "
         r"Ankles \d+\.\d\d cm from captured \(rms\); as fitted \d+\.\d\d cm\.", status
     )  # fmt: skip
+    for slider in sliders.locator("input[type=range]").all():
+        if "∞" in (slider.get_attribute("aria-valuetext") or ""):
+            assert float(slider.input_value()) > 0.99 * float(slider.get_attribute("max"))
     changes = page.locator("#live-changes").inner_text()
     assert changes == "foot.max_pitch = 0.3\nleg.weight = 0.61"
     page.get_by_role("button", name="fitted", exact=True).click()

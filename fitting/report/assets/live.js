@@ -201,7 +201,7 @@ class LivePanel {
       const text = slider.switch ? (value ? "on" : "off") : shownNumber(value) + unit;
       if (slider.switch) input.checked = value > 0;
       else {
-        input.value = value;
+        input.value = Math.min(Math.max(value, slider.low), slider.high); // it may be infinite
         input.setAttribute("aria-valuetext", text);
       }
       output.textContent = text;
