@@ -184,9 +184,10 @@ def test_in_the_air_the_root_waits_for_the_landing():
 
 
 def test_a_root_starts_settled_and_keeps_its_height_over_a_hole_and_where_the_ground_ends():
-    ray = {"ray_down": 0.2}  # less than a step: the root does not sink to the end of its ray
-    for ends, numbers in (((0.2, np.nan, 0.2), {}), ((0.0, 0.0, np.nan), ray), ((0.7,) * 3, {})):
-        lifted = heights(ground_of(*ends), glide(), GroundRoot(**numbers))
+    short = 0.2  # m, less than a step: the root does not sink to the end of its ray
+    cases = ((0.2, np.nan, 0.2), np.inf), ((0.0, 0.0, np.nan), short), ((0.7,) * 3, np.inf)
+    for ends, ray_down in cases:
+        lifted = heights(ground_of(*ends), glide(), GroundRoot(ray_down=ray_down))
         np.testing.assert_allclose(lifted, ends[0], atol=1e-6, err_msg=f"{ends}")
 
 
