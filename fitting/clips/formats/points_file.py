@@ -58,7 +58,7 @@ def read_table(path: Path) -> Markers:
     for number, name in enumerate(names):
         if match := COLUMN.fullmatch(name.strip()):
             columns.setdefault(match["name"], {})[match["axis"].lower()] = number
-            units.add((match["unit"] or "").lower())
+            units |= {match["unit"].lower()} if match["unit"] else set()
     points = {name: at for name, at in columns.items() if len(at) == 3}
     if not points:
         raise ValueError(
@@ -69,7 +69,7 @@ def read_table(path: Path) -> Markers:
     times = [number for number, name in enumerate(names) if TIME.fullmatch(name.strip())]
     frame_time = _frame_time(values[:, times[0]]) if times else None
     order = [[at[axis] for axis in "xyz"] for at in points.values()]
-    stated = UNITS[units.pop()] if len(units) == 1 and units <= set(UNITS) else None
+    stated = UNITS[units.pop()] if len(units) == 1 else None
     return _markers(tuple(points), values[:, order], frame_time, stated)
 
 
