@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from string import ascii_lowercase
 from typing import NamedTuple
 
-from .graph import BOOL, FLOAT, INT, UNSIGNED, Node, Number, needed
+from .graph import BOOL, FLOAT, INT, TABLES, UNSIGNED, Node, Number, needed
 from .program import Place, Program
 from .repeats import Cone, Repeats
 from .routines import Routine
 from .schedule import Part, Schedule, Target, is_free
 
-WIDTH = 110  # of an expression, from which it gets a name of its own
-LETTERS = {FLOAT: "f", INT: "i", UNSIGNED: "u", BOOL: "b"}
+WIDTH = 110  # letters
+LETTERS = {FLOAT: "f", INT: "i", UNSIGNED: "u", BOOL: "b", **dict.fromkeys(TABLES.values(), "t")}
 
 
 class Language(abc.ABC):
@@ -28,6 +28,8 @@ class Language(abc.ABC):
     """By operation and type of the operands, of which {0} is the first."""
     helpers: Mapping[str, str]
     """Functions that expressions call, by their names without the prefix."""
+    width: int = WIDTH
+    """Of an expression, from which it gets a name of its own."""
 
     @abc.abstractmethod
     def literal(self, value: Number) -> str:
@@ -185,7 +187,9 @@ class _Function:
             operands = map(self._text, self.repeats.operands(self.graph, node))
             text = self._expression(node).format(*operands)
             single = self.uses[node] == 1 and node not in self.part.writes
-            self.texts[node] = text if single and len(text) < WIDTH else self._local(node, text)
+            self.texts[node] = (
+                text if single and len(text) < self.language.width else self._local(node, text)
+            )
 
     def _expression(self, node: Node) -> str:
         if node in self.repeats.calls:

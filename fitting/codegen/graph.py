@@ -15,6 +15,8 @@ import numpy as np
 Node: TypeAlias = int
 FLOAT, INT, UNSIGNED, BOOL = "float", "int", "unsigned", "bool"
 DTYPES = {FLOAT: np.float32, INT: np.int32, UNSIGNED: np.uint32, BOOL: np.bool_}
+TABLES = {kind: f"table of {kind}" for kind in (FLOAT, INT, UNSIGNED)}
+"""Types of large arrays, of which numbers are read at an index."""
 Number: TypeAlias = Any
 """Of NumPy, of one of these types."""
 
@@ -96,6 +98,7 @@ OPERATIONS = {
     "greater": Operation(lambda a, b: a if a > b else b),
     "sign_bit": Operation(np.signbit, BOOL),
     "copysign": Operation(np.copysign),
+    **{f"read_{kind}": Operation(lambda index, table: table[index], kind) for kind in TABLES},
 }
 """Of StableHLO, as far as they act on single numbers. `GT` and `GE` are `LT` and `LE` turned round,
 and conversions have a name for each pair of types. The last four come of patterns: `lesser` and

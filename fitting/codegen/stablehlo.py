@@ -9,7 +9,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jax.export import Exported
@@ -17,6 +17,20 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import stablehlo as dialect
 
 from .graph import BOOL, DTYPES, FLOAT, INT, UNSIGNED, Graph, Node
+
+
+class Table(NamedTuple):
+    """An array that is not taken apart: numbers of it are read at an index."""
+
+    node: Node
+    kind: str
+    """Of its numbers."""
+    shape: tuple[int, ...]
+
+    def reshape(self, shape: tuple[int, ...]) -> "Table":
+        """The same numbers in another shape."""
+        return self._replace(shape=shape)
+
 
 Nodes: TypeAlias = np.ndarray
 """The nodes of an array, in its shape."""
@@ -28,11 +42,12 @@ KINDS = {"f32": FLOAT, "i32": INT, "ui32": UNSIGNED, "i1": BOOL}
 LOOPS = ("while", "sort", "reduce_window", "select_and_scatter", "scatter", "map")
 
 
-def read(exported: Exported, graph: Graph, arguments: Sequence[Nodes]) -> list[Nodes]:
+def read(exported: Exported, graph: Graph, arguments: Sequence[Nodes | Table]) -> list[Nodes]:
     """The results of an exported program of these arguments, as nodes of the graph.
 
     Raises:
-        ValueError: the program has an operation without a rule, such as a loop; it says which.
+        ValueError: the program has an operation without a rule, such as a loop, or one that does
+            more with a table than read it; it says which.
     """
     with ir.Context() as context:
         dialect.register_dialect(context)
@@ -50,14 +65,15 @@ class _Reader:
         self.graph = graph
         self.functions = functions
 
-    def block(self, block: ir.Block, arguments: Sequence[Nodes]) -> Sequence[Nodes]:
+    def block(self, block: ir.Block, arguments: Sequence[Any]) -> Sequence[Any]:
         """What a block, of a function or of a reduction, returns."""
-        known: dict[ir.Value, Nodes] = dict(zip(block.arguments, arguments, strict=True))
+        known: dict[ir.Value, Any] = dict(zip(block.arguments, arguments, strict=True))
         for operation in block.operations:
             operands = [known[value] for value in operation.operands]
             if operation.operation.name in ("func.return", "stablehlo.return"):
                 return operands
-            results = _rule(operation)(self, operation, *operands)
+            of_table = any(isinstance(operand, Table) for operand in operands)
+            results = _rule(operation, of_table)(self, operation, *operands)
             known |= zip(operation.results, results, strict=True)
         raise ValueError("a block of the program does not return")
 
@@ -73,6 +89,22 @@ class _Reader:
     def function(self, name: str, operands: Sequence[Nodes]) -> Sequence[Nodes]:
         """What a function of the program returns."""
         return self.block(self.functions[name], operands)
+
+    def window(self, table: Table, starts: Sequence[Node], sizes: Sequence[int]) -> Nodes:
+        """Numbers of a table, from indices on that are clipped to leave room for as many."""
+        corner = self.graph.constant(np.int32(0))
+        for start, size, length in zip(starts, sizes, table.shape, strict=True):
+            last = self.graph.constant(np.int32(length - size))
+            at = self.graph.add("minimum", last, start)
+            at = self.graph.add("maximum", self.graph.constant(np.int32(0)), at)
+            corner = self.graph.add("multiply", corner, self.graph.constant(np.int32(length)))
+            corner = self.graph.add("add", corner, at)
+        window = np.zeros(tuple(sizes), np.int64)
+        for index in np.ndindex(*sizes):
+            beyond = np.int32(np.ravel_multi_index(index, table.shape))
+            at = self.graph.add("add", corner, self.graph.constant(beyond))
+            window[index] = self.graph.add(f"read_{table.kind}", at, table.node)
+        return window
 
     def at(self, choices: Nodes, index: Node, last: int) -> Nodes:
         """The entry of the first axis at an index, which is clipped to 0..`last`."""
@@ -91,12 +123,14 @@ def _array(nodes: Iterable[Node], shape: tuple[int, ...]) -> Nodes:
     return np.fromiter(nodes, np.int64, math.prod(shape)).reshape(shape)
 
 
-def _rule(operation: Operation) -> Rule:
+def _rule(operation: Operation, of_table: bool) -> Rule:
     name = operation.operation.name.removeprefix("stablehlo.")
-    if name in RULES:
+    if name in RULES and (name in OF_TABLES or not of_table):
         return RULES[name]
     where = str(operation.location).removeprefix("loc(").removesuffix(")")
     place = where.split('"')[1] if '"' in where else where
+    if name in RULES:
+        raise ValueError(f"the operation {name!r} in {place} does more with a table than read it")
     if name in LOOPS:
         raise ValueError(
             f"the system has a loop, {name!r} in {place}; code without loops is exported, and "
@@ -248,7 +282,9 @@ def _dynamic_slice(
     return [x]
 
 
-def _gather(reader: _Reader, operation: Operation, x: Nodes, indices: Nodes) -> Sequence[Nodes]:
+def _gather(
+    reader: _Reader, operation: Operation, x: Nodes | Table, indices: Nodes
+) -> Sequence[Nodes]:
     names = dialect.GatherDimensionNumbers(operation.attributes["dimension_numbers"])
     if names.operand_batching_dims:
         raise ValueError("there is no rule for a gather with batching dimensions")
@@ -258,12 +294,16 @@ def _gather(reader: _Reader, operation: Operation, x: Nodes, indices: Nodes) -> 
     indices = np.moveaxis(indices, names.index_vector_dim, -1)
     slices = []
     for place in indices.reshape(-1, indices.shape[-1]):
-        windows = np.lib.stride_tricks.sliding_window_view(x, sizes)
-        for axis in range(x.ndim):
-            numbers = [i for i, target in enumerate(names.start_index_map) if target == axis]
-            start = int(place[numbers[0]]) if numbers else reader.graph.constant(np.int32(0))
-            windows = reader.at(windows, start, len(windows) - 1)
-        slices.append(np.squeeze(windows, tuple(names.collapsed_slice_dims)))
+        starts = [reader.constant(np.int32(0)).item()] * len(sizes)
+        for number, axis in zip(place.tolist(), names.start_index_map, strict=True):
+            starts[axis] = number
+        if isinstance(x, Table):
+            window = reader.window(x, starts, sizes)
+        else:
+            window = np.lib.stride_tricks.sliding_window_view(x, sizes)
+            for start in starts:
+                window = reader.at(window, start, len(window) - 1)
+        slices.append(np.squeeze(window, tuple(names.collapsed_slice_dims)))
     batch = indices.shape[:-1]
     gathered = np.array(slices, np.int64).reshape(*batch, *slices[0].shape)
     # The axes of slices go to their places among those of the batch.
@@ -333,6 +373,7 @@ ELEMENTWISE = (
     " round_nearest_even rsqrt shift_left shift_right_arithmetic shift_right_logical sign sine"
     " sqrt subtract tan tanh xor"
 ).split()
+OF_TABLES = ("composite", "func.call", "gather", "optimization_barrier", "reshape")
 # By the name of the operation of StableHLO.
 RULES: dict[str, Rule] = {
     **{name: _elementwise(name) for name in ELEMENTWISE},

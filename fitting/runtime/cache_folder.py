@@ -22,7 +22,7 @@ from .validation import in_one_line
 
 FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  # settings of JAX
 MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"
-TRACED = "traced"  # inside JAX's folder
+TRACED, KERNELS = "traced", "kernels"  # inside JAX's folder
 # Names of complete and of half-written files: of ours, and of JAX's.
 TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*(\.jaxik-\w+-\d+-\w+)?")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)(\.jaxik-\w+-\d+-\w+)?")
@@ -80,16 +80,26 @@ def traced() -> Path:
         SwitchedOffError: JAX's settings say that none are cached.
         OSError: the folder cannot be made, or is not safe from others.
     """
+    folder = _own_folder(TRACED)
+    if jax.device_count() > 1:
+        raise SwitchedOffError(f"there are {jax.device_count()} devices; programs are for one")
+    return folder
+
+
+def kernels() -> Path:
+    """The user's own folder for compiled C code, as `traced`."""
+    return _own_folder(KERNELS)
+
+
+def _own_folder(name: str) -> Path:
     folder = setting(FOLDER)
     if not folder:
         raise SwitchedOffError(f"{FOLDER} names no folder")
     if not setting(ENABLED):
         raise SwitchedOffError(f"{ENABLED} is off")
     if "://" in str(folder):
-        raise SwitchedOffError(f"traced programs are cached on this machine only, not in {folder}")
-    if jax.device_count() > 1:
-        raise SwitchedOffError(f"there are {jax.device_count()} devices; programs are for one")
-    path = Path(str(folder), TRACED)
+        raise SwitchedOffError(f"programs are cached on this machine only, not in {folder}")
+    path = Path(str(folder), name)
     _make_own(path)
     return path
 

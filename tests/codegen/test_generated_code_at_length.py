@@ -15,7 +15,7 @@ import pytest
 
 import jaxik
 from fitting.bench import workloads
-from fitting.codegen import export
+from fitting.codegen import crowd, export
 from fitting.codegen.toolchain import Compiled, Outputs, Playback
 from fitting.runtime.precision import with_floats
 from jaxik.maths import parameter_tree
@@ -318,3 +318,49 @@ def test_sanitizers_report_nothing_on_bad_frames(name, tmp_path):
     subprocess.run(build, cwd=tmp_path, check=True)
     done = subprocess.run(["./check"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and not done.stderr, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("name", ["record", "stride", "ozz", "mec", "unreal"])
+@pytest.mark.parametrize("ground", ["plane", "heights"])
+def test_a_crowd_in_lanes_is_that_of_jax(name, ground, monkeypatch):
+    """Characters of their own paces and places, of which some have faults."""
+    count, members, legs = 100, 37, 2
+    rig = single(to_rig(make_rig(legs=legs)))
+    terrains = {"plane": terrain.plane(normal=(0.1, 1.0, 0.05)), "heights": heights()}
+    rng = np.random.default_rng(0)
+    clips = [
+        moved_clip(frames_of(legs, 10 * members + count, 2), 10 * number, count, rng)
+        for number in range(members)
+    ]
+    frames = jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
+    with jax.enable_x64(False):
+        frames, ik = single(frames), single(getattr(jaxik.presets, name)(rig))
+        arguments = (ik, rig, single(terrains[ground]), frames)
+        crowd.kernel_of(*arguments)  # it is there
+        ours = crowd.run_crowd(*arguments)
+        monkeypatch.setenv(crowd.SWITCH, "0")
+        theirs = jax.device_get(crowd.run_crowd(*arguments))
+    np.testing.assert_array_equal(ours.faulty, theirs.faulty)
+    assert 0 < np.mean(ours.faulty) < 0.1
+    flat = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree) for tree in (ours, theirs))
+    off = differences(*flat) > CLOSE
+    # A decision may fall a frame earlier or later, and its traces fade.
+    assert np.mean(off) < PARTED and np.median(differences(ours, theirs)) < CLOSE
+
+
+def heights() -> terrain.Terrain:
+    x, z = np.meshgrid(np.arange(-40.0, 40.0, 0.25), np.arange(-40.0, 40.0, 0.25))
+    rough = 0.05 * np.sin(2.0 * x) + 0.04 * np.cos(3.0 * z)
+    return terrain.heightfield(rough.astype(np.float32), 0.25, origin=(-40.0, 0.0, -40.0))
+
+
+def moved_clip(
+    frames: jaxik.Frame, first: int, count: int, rng: np.random.Generator
+) -> jaxik.Frame:
+    """A part of a clip somewhere else, at another pace."""
+    part = jax.tree.map(lambda leaf: np.asarray(leaf)[first : first + count], frames)
+    world = part.world_from_model
+    pos = world.pos + rng.uniform(-20.0, 20.0, 3) * [1.0, 0.0, 1.0]
+    return dataclasses.replace(
+        part, world_from_model=Transform(pos, world.rot), dt=part.dt * rng.uniform(0.5, 2.0)
+    )

@@ -1,0 +1,394 @@
+"""Crowds by compiled code over vector lanes: built on first use, and kept with cached programs.
+
+The code is C for this machine's processor. It is called through NumPy, without JAX, and so cannot
+be traced or differentiated: `jaxik.lanes` can.
+"""
+
+# pyright: reportArgumentType=false
+
+import contextlib
+import ctypes
+import dataclasses
+import functools
+import hashlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Int, PyTree
+
+import jaxik
+from fitting.runtime import activity, cache_folder, files, machine
+from fitting.runtime.threads import on_all_cores, usable_cores
+from fitting.runtime.validation import in_one_line
+from jaxik.world.terrain import LegTerrains, Terrain
+
+from . import crowd_program, toolchain
+from .crowd_program import CrowdProgram, Keep
+from .graph import BOOL, DTYPES
+from .program import fields_of
+
+SWITCH = "JAXIK_CROWD_KERNELS"  # environment variable; 0 switches them off
+FLAGS = ("-O2", "-std=gnu11", "-march=native", "-fno-math-errno", "-shared", "-fPIC")
+LANES = {512: 16, 256: 8}  # by bits of the processor's vectors; others take 4
+PLACE = np.dtype([("at", np.uintp), ("member", np.intp), ("frame", np.intp)])
+FARTHEST = 2**31  # bytes by which numbers of the characters of a block may be apart
+ALIGNMENT = 64  # bytes, of results: lines of the cache
+STRUCTS = ("parameters", "rig", "terrain", "frame")
+
+Axes: TypeAlias = tuple[Any, Any, Any, Any]
+"""Of system, rig, terrain and frames: as `in_axes` of `jaxik.lanes`."""
+
+
+class NoKernelError(Exception):
+    """There is no compiled code for a crowd; the message says why."""
+
+
+class Kernel(NamedTuple):
+    """The compiled code of a system on a kind of ground."""
+
+    built: CrowdProgram
+    lanes: int
+    """How many characters it computes at once."""
+    run: Callable[..., None]
+
+
+def without_trace(result: jaxik.Result) -> jaxik.Result:
+    """A result without the outputs of stages."""
+    return dataclasses.replace(result, trace=None)
+
+
+def run_crowd(
+    ik: jaxik.FootIK,
+    rig: jaxik.Rig,
+    terrain: Terrain | LegTerrains,
+    frames: jaxik.Frame,
+    in_axes: Axes = (None, None, None, 0),
+    out_axes: int = 0,
+    *,
+    starts: Int[ArrayLike, " characters"] | None = None,
+    count: int | None = None,
+    keep: Keep = without_trace,
+    checked: bool = False,
+) -> PyTree:
+    """What `jaxik.run` gives for each of many characters, by C code where that can be compiled.
+
+    The code is built when it is first needed, in less time than JAX compiles its program, and runs
+    on all cores. Results differ from JAX's by rounding. `jaxik.lanes` computes them where there is
+    no compiler, floats have 64 bits, the ground is a mesh or JAXIK_CROWD_KERNELS is 0.
+
+    Args:
+        ik: the system; its rules and options are those of all.
+        rig: the legs.
+        terrain: the ground; its large arrays, such as heights, are those of all.
+        frames: the animation, as for `jaxik.run`.
+        in_axes: of each of these four the axis of characters, None where all share it; or a tree
+            of axes.
+        out_axes: where the axis of characters is in the results, 0 or -1, which is faster.
+        starts: the frame with which each character begins; None is the first.
+        count: how many frames are computed from there on; None takes all.
+        keep: what of a frame's result is kept, as a tree of its arrays. It must be a function of a
+            module, as code is built for each new one.
+        checked: a promise that all frames are sound, as in `jaxik.run`.
+
+    Returns:
+        What is kept, with axes (characters, frames, ...) or (frames, ..., characters).
+
+    Raises:
+        ValueError: there is no axis of characters, or their numbers differ; a clip ends before a
+            character has its frames; arrays do not fit the legs.
+    """
+    call = _Call.of((ik, rig, terrain, frames), in_axes, starts, count, keep, checked)
+    try:
+        kernel = _kernel(call)
+    except NoKernelError:
+        return _by_lanes(call, out_axes)
+    return _by_kernel(kernel, call, out_axes)
+
+
+def kernel_of(
+    ik: jaxik.FootIK,
+    rig: jaxik.Rig,
+    terrain: Terrain | LegTerrains,
+    frames: jaxik.Frame,
+    in_axes: Axes = (None, None, None, 0),
+    *,
+    keep: Keep = without_trace,
+    checked: bool = False,
+) -> Kernel:
+    """The code that `run_crowd` would run for these arguments, built if it is not there.
+
+    Raises:
+        NoKernelError: it would run none.
+        ValueError: as `run_crowd`.
+    """
+    return _kernel(_Call.of((ik, rig, terrain, frames), in_axes, None, None, keep, checked))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """The arguments of `run_crowd`."""
+
+    trees: tuple
+    axes: tuple[tuple[int | None, ...], ...]
+    """Of the leaves of each tree."""
+    arrays: tuple[list[np.ndarray], ...]
+    """The leaves of each tree, with an axis of characters and one of frames in front; see
+    `_spread`."""
+    members: int
+    starts: np.ndarray | None
+    count: int
+    """Frames of each character."""
+    keep: Keep
+    checked: bool
+
+    @classmethod
+    def of(
+        cls,
+        trees: tuple,
+        in_axes: Axes,
+        starts: Int[ArrayLike, " characters"] | None,
+        count: int | None,
+        keep: Keep,
+        checked: bool,
+    ) -> "_Call":
+        axes = tuple(_leaf_axes(each, tree) for each, tree in zip(in_axes, trees, strict=True))
+        arrays = tuple(
+            [
+                _spread(leaf, axis, struct == "frame")
+                for leaf, axis in zip(jax.tree.leaves(tree), each, strict=True)
+            ]
+            for struct, tree, each in zip(STRUCTS, trees, axes, strict=True)
+        )
+        sizes = {
+            len(array)
+            for part, each in zip(arrays, axes, strict=True)
+            for array, axis in zip(part, each, strict=True)
+            if axis is not None
+        }
+        if starts is not None:
+            starts = np.ascontiguousarray(starts, np.int32)
+            sizes.add(len(starts))
+        if len(sizes) != 1 or 0 in sizes:
+            raise ValueError(f"numbers of characters: {sorted(sizes)}; wanted one, of 1 or more")
+        lengths = {array.shape[1] for array in arrays[-1]}
+        if len(lengths) != 1:
+            raise ValueError(f"numbers of frames: {sorted(lengths)}; wanted one number")
+        length = lengths.pop()
+        each = length if count is None else count
+        first, last = (0, 0) if starts is None else (int(starts.min()), int(starts.max()))
+        if min(first, each) < 0 or last + each > length:
+            raise ValueError(
+                f"{each} frames from frames {first} to {last} on; the clip has {length}"
+            )
+        return cls(trees, axes, arrays, sizes.pop(), starts, each, keep, checked)
+
+
+def _is_none(axis: Any) -> bool:
+    return axis is None
+
+
+def _leaf_axes(axes: Any, tree: PyTree) -> tuple[int | None, ...]:
+    """The axis of each leaf, from axes of leaves or of whole subtrees."""
+    broadcast = jax.tree.broadcast(axes, tree, is_leaf=_is_none)
+    return tuple(jax.tree.structure(tree).flatten_up_to(broadcast))
+
+
+def _spread(leaf: ArrayLike, axis: int | None, of_frames: bool) -> np.ndarray:
+    """An array with an axis of characters and one of frames in front; of length 1 for none."""
+    array = np.asarray(leaf)
+    array = array[None] if axis is None else np.moveaxis(array, axis, 0)
+    return array if of_frames else array[:, None]
+
+
+def _kernel(call: _Call) -> Kernel:
+    """The code for a call.
+
+    Raises:
+        NoKernelError: there is none.
+        ValueError: arrays do not fit the legs.
+    """
+    if os.environ.get(SWITCH) == "0":
+        raise NoKernelError(f"{SWITCH} is 0")
+    if jax.default_backend() != "cpu":
+        raise NoKernelError("an accelerator computes")
+    arrays = [array for part in call.arrays for array in part]
+    types = {array.dtype for array in arrays}
+    if types - {np.dtype(dtype) for dtype in DTYPES.values()}:
+        raise NoKernelError(f"numbers of the types {sorted(map(str, types))}; C has 32 bits")
+    shapes = tuple((array.shape[2:], array.dtype.str) for array in arrays)
+    kernel = _built(jax.tree.structure(call.trees), shapes, call.keep, call.checked)
+    if isinstance(kernel, NoKernelError):
+        raise kernel
+    last = 0 if call.starts is None else int(call.starts.max())
+    apart = [abs(x.strides[0]) * kernel.lanes + abs(x.strides[1]) * last for x in arrays]
+    if max(apart) >= FARTHEST:
+        raise NoKernelError(f"numbers of neighbours are {max(apart)} bytes apart")
+    if any(call.axes[2][number] is not None for number in kernel.built.tables):
+        raise NoKernelError("characters have large arrays of terrain of their own")
+    return kernel
+
+
+@functools.lru_cache(maxsize=64)
+def _built(structure: Any, shapes: tuple, keep: Keep, checked: bool) -> Kernel | NoKernelError:
+    """The code for arguments of these shapes, or why there is none: neither is looked for again."""
+    try:
+        return _build(structure, shapes, keep, checked)
+    except NoKernelError as error:
+        return error
+
+
+def _build(structure: Any, shapes: tuple, keep: Keep, checked: bool) -> Kernel:
+    if toolchain.compiler() is None:
+        raise NoKernelError("no C compiler: $CC is not set, and there is no cc")
+    leaves = [jax.ShapeDtypeStruct(shape, np.dtype(dtype)) for shape, dtype in shapes]
+    ik, rig, terrain, frame = jax.tree.unflatten(structure, leaves)
+    with activity.announced("Building code for a crowd"):
+        try:
+            built = crowd_program.build(ik, rig, terrain, frame, keep, checked=checked)
+        except ValueError as error:  # there is no rule, or JAX will say the same
+            raise NoKernelError(in_one_line(error)) from error
+        try:
+            return compiled(built)
+        except (OSError, ValueError, subprocess.SubprocessError) as error:
+            cache_folder.warn_once("crowds are computed by JAX, as C failed", in_one_line(error))
+            raise NoKernelError(in_one_line(error)) from error
+
+
+def compiled(built: CrowdProgram) -> Kernel:
+    """The code of a program, compiled or from the folder of cached programs.
+
+    Raises:
+        OSError: there is no compiler, or the code cannot be written or loaded.
+        ValueError: the compiler refuses it.
+        subprocess.SubprocessError: the compiler fails.
+    """
+    lanes = LANES.get(machine.vector_bits() or 0, 4)
+    return Kernel(built, lanes, _library(toolchain.compiler() or "cc", built.source(lanes)).run)
+
+
+def _library(compiler: str, source: str) -> ctypes.CDLL:
+    """The compiled code of a file, from the folder of cached programs if it is there."""
+    version = subprocess.run([compiler, "--version"], check=True, capture_output=True, text=True)
+    parts = [source, *FLAGS, compiler, version.stdout, machine.processor()]
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    with contextlib.ExitStack() as stack:
+        try:
+            folder = cache_folder.kernels()
+        except cache_folder.SwitchedOffError:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        path = folder / f"crowd-{key}.so"
+        if not path.exists():
+            files.write(path, lambda to: _compile(compiler, source, to), lasting=False)
+        cache_folder.check_own(path, path.stat())
+        return ctypes.CDLL(str(path))
+
+
+def _compile(compiler: str, source: str, to: Path) -> None:
+    command = [compiler, *FLAGS, "-x", "c", "-", "-o", str(to), "-lm"]
+    done = subprocess.run(command, input=source, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"{compiler}: {done.stderr.strip().partition(chr(10))[0]}")
+
+
+def _by_kernel(kernel: Kernel, call: _Call, out_axes: int) -> PyTree:
+    """The results of compiled code."""
+    built, words = kernel.built, {}
+    for struct, tree, arrays in zip(STRUCTS, call.trees, call.arrays, strict=True):
+        for field, array in zip(fields_of(tree), arrays, strict=True):
+            words[struct, field.path] = array.astype(np.int32) if field.kind == BOOL else array
+    inputs = [
+        _address(words[place.struct, place.field.path], place.index, place.struct == "frame")
+        for place in (*built.setup, *built.moving)
+    ]
+    tables = [np.ascontiguousarray(call.arrays[2][number][0, 0]) for number in built.tables]
+    results, outputs = [], []
+    for field in built.program.fields("result"):
+        dtype = np.int32 if field.kind == BOOL else DTYPES[field.kind]
+        if out_axes == 0:
+            result = spread = _empty((call.members, call.count, *field.shape), dtype)
+        else:
+            result = _empty((call.count, *field.shape, call.members), dtype)
+            spread = np.moveaxis(result, -1, 0)
+        results.append(result)
+        outputs += [_address(spread, index, True) for index in np.ndindex(*field.shape)]
+    _run(kernel, call, np.array(inputs, PLACE), np.array(outputs, PLACE), tables)
+    typed = [
+        result != 0 if field.kind == BOOL else result
+        for field, result in zip(built.program.fields("result"), results, strict=True)
+    ]
+    return jax.tree.unflatten(jax.tree.structure(built.program.trees["result"]), typed)
+
+
+def _run(
+    kernel: Kernel,
+    call: _Call,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    tables: Sequence[np.ndarray],
+) -> None:
+    """Computes all characters, on all cores."""
+    pointers = (ctypes.c_void_p * (len(tables) + 1))(*(table.ctypes.data for table in tables))
+    shared = [_pointer(inputs), _pointer(outputs), pointers, _pointer(call.starts)]
+    blocks = -(-call.members // kernel.lanes)
+    each = kernel.lanes * -(-blocks // usable_cores())
+    calls = [
+        functools.partial(
+            kernel.run,
+            *shared,
+            *map(ctypes.c_ssize_t, (first, min(each, call.members - first), call.count)),
+        )
+        for first in range(0, call.members, each)
+    ]
+    on_all_cores(calls)
+
+
+def _pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
+    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+
+
+def _address(array: np.ndarray, index: tuple[int, ...], of_frames: bool) -> tuple[int, int, int]:
+    """Where a number is: of the first character and frame, and bytes to those of others."""
+    members, frames, *rest = array.strides
+    at = array.ctypes.data + sum(i * stride for i, stride in zip(index, rest, strict=True))
+    return at, members if len(array) > 1 else 0, frames if of_frames else 0
+
+
+def _empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """A new array that begins with a line of the cache."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory = np.empty(size + ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % ALIGNMENT
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
+def _by_lanes(call: _Call, out_axes: int) -> PyTree:
+    """The results of JAX."""
+    leaves, structure = jax.tree.flatten(call.trees)
+    axes = tuple(axis for each in call.axes for axis in each)
+    starts = np.zeros(call.members, np.int32) if call.starts is None else call.starts
+    return _lanes(leaves, starts, structure, axes, out_axes, call.count, call.keep, call.checked)
+
+
+@functools.partial(jax.jit, static_argnums=range(2, 8))
+def _lanes(
+    leaves: list,
+    starts: Int[ArrayLike, " characters"],
+    structure: Any,
+    axes: tuple[int | None, ...],
+    out_axes: int,
+    count: int,
+    keep: Keep,
+    checked: bool,
+) -> PyTree:
+    def of_one(leaves: list, start: Any) -> PyTree:
+        ik, rig, terrain, frames = jax.tree.unflatten(structure, leaves)
+        frames = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, count), frames)
+        return keep(jaxik.run(ik, rig, terrain, frames, checked=checked))
+
+    return jaxik.lanes(of_one, in_axes=(list(axes), 0), out_axes=out_axes)(leaves, starts)
