@@ -25,6 +25,7 @@ import jaxik
 from fitting.clips import edit
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.codegen import toolchain
+from fitting.codegen.crowd import NoKernelError
 from fitting.codegen.export import export_c
 from fitting.codegen.toolchain import Compiled, Playback
 from fitting.experiment.problems import ClipData
@@ -46,7 +47,7 @@ from jaxik.stages.leg import LegGoal, SolvedLeg
 from jaxik.world import terrain
 from jaxik.world.terrain import Hit, Terrain, cast, plane
 
-from . import baselines, processes, workloads
+from . import baselines, crowds, processes, workloads
 from .measurement import (
     Benchmark,
     Call,
@@ -420,21 +421,38 @@ def in_chunks(
 
 
 def crowd(measurement: Measurement, sizes: Sizes) -> None:
-    """The whole pipeline for a crowd, on a plane and on a mesh."""
+    """The whole pipeline for a crowd, on a plane, heights and a mesh: by JAX, and by C lanes."""
     people = workloads.crowd(sizes.characters, sizes.frames)
     count = sizes.characters * sizes.frames * people.rig.side.size
     mesh = workloads.ground(workloads.mesh_field(sizes.cells))
-    grounds = {"plane": (workloads.single(plane()), 9.0), "mesh": (mesh, 5.0)}
+    flat, heights = workloads.single(plane()), workloads.height_field(sizes.cells)
+    grounds = {"plane": (flat, 9.0), "heights": (heights, None), "mesh": (mesh, 5.0)}
     calls = {
         name: in_chunks(measurement, name, forward, people, ground, sizes.chunk)
         for name, (ground, _) in grounds.items()
     }
+    kernels: dict[str, str] = {}
+    for name, (ground, _) in grounds.items():
+        start, size = time.perf_counter(), min(usable_cores() * sizes.chunk, sizes.characters)
+        measurement.progress(f"crowd: compiling {name} in C")
+        try:
+            calls[f"{name}, C"], kernels[name] = crowds.by_kernel(people, ground, size)
+        except NoKernelError as error:
+            measurement.notes.append(f"{name} by JAX only: {error}")
+        else:
+            measurement.compile_s[f"{name}, C"] = time.perf_counter() - start
     machine.reset_peak()
     measurement.time_in_turns(calls, sizes.crowd_repeats)
     peak = peak_memory_mb()
     for name, (_, target) in grounds.items():
-        what, at_least = f"{name}, leg-frames a second", target / time_in_width()
+        what, at_least = f"{name}, leg-frames a second", target and target / time_in_width()
         _add_leg_frames(measurement, name, what, count, at_least=at_least)
+    for name, kernel in kernels.items():
+        what, cores = f"{name} by {kernel}: leg-frames a second", usable_cores()
+        measurement.add_timing(f"{name}, C", what, "M", items=count, threads=cores)
+        by_jax, by_c = (statistics.median(measurement.busy[key]) for key in (name, f"{name}, C"))
+        what = f"{name}: JAX's CPU time in that of C"
+        measurement.add(what, by_jax / max(by_c, 1e-9), "times", at_least=3.0)
     note = "all results of the crowd are kept"
     measurement.add("peak of memory", peak, "MB", note=note)
 

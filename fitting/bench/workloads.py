@@ -105,6 +105,14 @@ def ground(mesh: meshes.Mesh) -> terrain.Terrain:
     return terrain.mesh(np.asarray(mesh.vertices, np.float32), mesh.faces)
 
 
+def height_field(cells: int) -> terrain.Terrain:
+    """Hills and rubble as those of `mesh_field`, as heights."""
+    random, pitch = np.random.default_rng(0), EXTENT / cells
+    lines = np.arange(cells + 1) * pitch
+    rough = random.normal(0.0, min(0.03, 0.1 * pitch), (len(lines), len(lines)))
+    return terrain.heightfield((0.15 * np.sin(lines) + rough).astype(np.float32), pitch)
+
+
 def ray_origins(count: int) -> Float[np.ndarray, "rays 3"]:
     """Random points above the mesh field, m."""
     origins = np.random.default_rng(1).uniform(0.0, EXTENT, (count, 3))
