@@ -17,6 +17,7 @@ from .clips import Clip as Clip
 from .clips import load_clip as load_clip
 from .clips import save_clip as save_clip
 from .clips.clip_frames import frames_from_clip as frames_from_clip
+from .codegen.crowd import run_crowd as run_crowd
 from .codegen.export import GoldenTrace as GoldenTrace
 from .codegen.export import export_c as export_c
 from .codegen.export import export_system as export_system

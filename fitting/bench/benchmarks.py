@@ -427,7 +427,7 @@ def crowd(measurement: Measurement, sizes: Sizes) -> None:
     mesh = workloads.ground(workloads.mesh_field(sizes.cells))
     flat, heights = workloads.single(plane()), workloads.height_field(sizes.cells)
     grounds = {"plane": (flat, 9.0), "heights": (heights, None), "mesh": (mesh, 5.0)}
-    calls = {
+    calls: dict[str, Call] = {
         name: in_chunks(measurement, name, forward, people, ground, sizes.chunk)
         for name, (ground, _) in grounds.items()
     }

@@ -45,7 +45,7 @@ def _arguments(
     """Those of `run_crowd` for some of a crowd, and the frames with which they start."""
     members = jax.tree.map(lambda leaf: np.asarray(leaf)[part], crowd.members)
     world_ws = np.asarray(crowd.motion.world_from_model.pos)
-    to_place = (members.place_ws - world_ws[members.first]) * np.float32([1, 0, 1])
+    to_place = (members.place_ws - world_ws[members.first]) * np.array([1, 0, 1], np.float32)
     frames = eqx.tree_at(
         lambda frame: frame.world_from_model.pos, crowd.motion, world_ws + to_place[:, None]
     )

@@ -14,6 +14,7 @@ import hashlib
 import os
 import subprocess
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -39,6 +40,7 @@ LANES = {512: 16, 256: 8}  # by bits of the processor's vectors; others take 4
 PLACE = np.dtype([("at", np.uintp), ("member", np.intp), ("frame", np.intp)])
 FARTHEST = 2**31  # bytes by which numbers of the characters of a block may be apart
 ALIGNMENT = 64  # bytes, of results: lines of the cache
+BUILDING = threading.Lock()  # several threads may need the same code
 STRUCTS = ("parameters", "rig", "terrain", "frame")
 
 Axes: TypeAlias = tuple[Any, Any, Any, Any]
@@ -75,12 +77,13 @@ def run_crowd(
     count: int | None = None,
     keep: Keep = without_trace,
     checked: bool = False,
+    cores: int | None = None,
 ) -> PyTree:
     """What `jaxik.run` gives for each of many characters, by C code where that can be compiled.
 
-    The code is built when it is first needed, in less time than JAX compiles its program, and runs
-    on all cores. Results differ from JAX's by rounding. `jaxik.lanes` computes them where there is
-    no compiler, floats have 64 bits, the ground is a mesh or JAXIK_CROWD_KERNELS is 0.
+    The code is built when it is first needed, in less time than JAX compiles its program. Results
+    differ from JAX's by rounding. `jaxik.lanes` computes them where there is no compiler, floats
+    have 64 bits, the ground is a mesh or JAXIK_CROWD_KERNELS is 0.
 
     Args:
         ik: the system; its rules and options are those of all.
@@ -95,6 +98,7 @@ def run_crowd(
         keep: what of a frame's result is kept, as a tree of its arrays. It must be a function of a
             module, as code is built for each new one.
         checked: a promise that all frames are sound, as in `jaxik.run`.
+        cores: how many compute; None takes all.
 
     Returns:
         What is kept, with axes (characters, frames, ...) or (frames, ..., characters).
@@ -108,7 +112,7 @@ def run_crowd(
         kernel = _kernel(call)
     except NoKernelError:
         return _by_lanes(call, out_axes)
-    return _by_kernel(kernel, call, out_axes)
+    return _by_kernel(kernel, call, out_axes, cores or usable_cores())
 
 
 def kernel_of(
@@ -222,7 +226,8 @@ def _kernel(call: _Call) -> Kernel:
     if types - {np.dtype(dtype) for dtype in DTYPES.values()}:
         raise NoKernelError(f"numbers of the types {sorted(map(str, types))}; C has 32 bits")
     shapes = tuple((array.shape[2:], array.dtype.str) for array in arrays)
-    kernel = _built(jax.tree.structure(call.trees), shapes, call.keep, call.checked)
+    with BUILDING:
+        kernel = _built(jax.tree.structure(call.trees), shapes, call.keep, call.checked)
     if isinstance(kernel, NoKernelError):
         raise kernel
     last = 0 if call.starts is None else int(call.starts.max())
@@ -296,7 +301,7 @@ def _compile(compiler: str, source: str, to: Path) -> None:
         raise ValueError(f"{compiler}: {done.stderr.strip().partition(chr(10))[0]}")
 
 
-def _by_kernel(kernel: Kernel, call: _Call, out_axes: int) -> PyTree:
+def _by_kernel(kernel: Kernel, call: _Call, out_axes: int, cores: int = 1) -> PyTree:
     """The results of compiled code."""
     built, words = kernel.built, {}
     for struct, tree, arrays in zip(STRUCTS, call.trees, call.arrays, strict=True):
@@ -317,7 +322,7 @@ def _by_kernel(kernel: Kernel, call: _Call, out_axes: int) -> PyTree:
             spread = np.moveaxis(result, -1, 0)
         results.append(result)
         outputs += [_address(spread, index, True) for index in np.ndindex(*field.shape)]
-    _run(kernel, call, np.array(inputs, PLACE), np.array(outputs, PLACE), tables)
+    _run(kernel, call, np.array(inputs, PLACE), np.array(outputs, PLACE), tables, cores)
     typed = [
         result != 0 if field.kind == BOOL else result
         for field, result in zip(built.program.fields("result"), results, strict=True)
@@ -331,12 +336,13 @@ def _run(
     inputs: np.ndarray,
     outputs: np.ndarray,
     tables: Sequence[np.ndarray],
+    cores: int,
 ) -> None:
-    """Computes all characters, on all cores."""
+    """Computes all characters."""
     pointers = (ctypes.c_void_p * (len(tables) + 1))(*(table.ctypes.data for table in tables))
     shared = [_pointer(inputs), _pointer(outputs), pointers, _pointer(call.starts)]
     blocks = -(-call.members // kernel.lanes)
-    each = kernel.lanes * -(-blocks // usable_cores())
+    each = kernel.lanes * -(-blocks // cores)
     calls = [
         functools.partial(
             kernel.run,
@@ -345,7 +351,10 @@ def _run(
         )
         for first in range(0, call.members, each)
     ]
-    on_all_cores(calls)
+    if len(calls) > 1:
+        on_all_cores(calls)
+    else:
+        calls[0]()
 
 
 def _pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:

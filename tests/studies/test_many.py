@@ -18,6 +18,7 @@ from distributed import LocalCluster
 import fitting
 import jaxik
 from fitting.cli import main
+from fitting.codegen import crowd, toolchain
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
@@ -25,6 +26,7 @@ from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
 from fitting.runtime import cluster
 from fitting.runtime.claimed_folder import claimed
+from fitting.runtime.precision import with_floats
 from fitting.studies.campaign import Campaign
 from fitting.studies.fit import run_folder
 from fitting.studies.many import evaluation
@@ -32,6 +34,7 @@ from fitting.studies.many import fit_many as many_fits
 from fitting.studies.many.fit_many import plan
 from jaxik.maths import parameter_tree
 from jaxik.world import body
+from jaxik.world.terrain import plane
 from support import scenes, small_studies
 from support.experiments import ROOT
 from support.watching import listening
@@ -255,6 +258,30 @@ def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
     seen = np.asarray(scene.reference.observed)
     expected = np.sqrt(np.mean(np.asarray(errors["pelvis"])[seen] ** 2, axis=0).sum())
     assert numbers["pelvis"][3, 1] == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("systems", "clips"), [(5, 1), (1, 3)])
+def test_data_of_32_bits_are_evaluated_by_c_code_alike(problem, ik, systems, clips, monkeypatch):
+    calls: list[bool] = []  # whether there was code for a chunk
+
+    def by_kernel(*arguments: Any) -> Any:
+        values = run(*arguments)
+        calls.append(values is not None)
+        return values
+
+    run = evaluation._Calls._by_kernel
+    monkeypatch.setattr(evaluation._Calls, "_by_kernel", by_kernel)
+    flat = [dataclasses.replace(s, terrain=plane(normal=(0.1, 1.0, 0.0))) for s in problem.data]
+    data = with_floats(flat[:clips], jnp.float32)
+    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS[:systems]})
+    ours = fitting.evaluate_many(batch, data, chunk=3)
+    assert all(calls) and (toolchain.compiler("c") is None or calls)
+    monkeypatch.setenv(crowd.SWITCH, "0")
+    theirs = fitting.evaluate_many(batch, data, chunk=3)
+    assert not all(calls) and ours.keys() == theirs.keys()
+    for name, values in theirs.items():
+        np.testing.assert_allclose(ours[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
 def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):

@@ -16,10 +16,12 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 import jaxik
+from fitting.codegen.crowd import Axes, NoKernelError, kernel_of, run_crowd
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
@@ -101,6 +103,9 @@ def evaluate_many(
     `jaxik.run` returns for it; on a CPU at most 64 for each device. With several processes
     (`jax.distributed.initialize`) each computes its part, and all get everything.
 
+    Where the arrays of the clips have 32 bits (`with_floats`) and there is a C compiler, systems
+    run as `fitting.run_crowd` runs them, on any ground but meshes.
+
     Args:
         ik_batch: systems, with an axis for them in front of each array; where its length is 1, all
             share the array. `vary`, and `jax.vmap` of anything that makes a system, make one.
@@ -175,8 +180,54 @@ class _Calls:
 
     def _compute(self, fixed: int, start: int, size: int) -> dict[str, np.ndarray]:
         """One chunk."""
-        values = _along(*self.arguments(fixed, start, size))
+        arguments = self.arguments(fixed, start, size)
+        values = self._by_kernel(*arguments) or _along(*arguments)
         return {name: np.asarray(value) for name, value in values.items()}
+
+    def _by_kernel(
+        self,
+        measure: Measure,
+        mesh: Mesh,
+        stacked: tuple[Stacked, Stacked],
+        ik: jaxik.FootIK,
+        scene: Scene,
+    ) -> dict[str, Array] | None:
+        """What `_along` gives, of what C code computes; None where there is none for it."""
+        if mesh.size > 1 or scene.frames.dt.dtype != np.float32:
+            return None
+        if scene.tracks or scene.size is not None:
+            return None
+        of_ik, of_scene = (
+            None if flags is None else shared_world.labelled(tree, flags, 0)
+            for tree, flags in zip((ik, scene), stacked, strict=True)
+        )
+        of_parts: tuple[Any, Any, Any] = (None, None, None)
+        if of_scene is not None:
+            of_parts = (of_scene.rig, of_scene.terrain, of_scene.frames)
+        axes: Axes = (of_ik, *of_parts)
+        keep = self._kept
+        try:
+            trees = (ik, scene.rig, scene.terrain, scene.frames)
+            kernel_of(*trees, axes, keep=keep, checked=True)
+        except NoKernelError:
+            return None
+        kept = run_crowd(*trees, axes, keep=keep, checked=True, cores=1)
+        return _measured(measure, keep, stacked[1], scene, kept)
+
+    @functools.cached_property
+    def _kept(self) -> "_Leaves":
+        """What the measure needs of a result."""
+        system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
+        result = jax.eval_shape(run_scene, system, scene)
+        leaves, structure = jax.tree.flatten(result)
+
+        def of_leaves(leaves: list, scene: Scene) -> dict[str, Array]:
+            return dict(self.measure(scene, jax.tree.unflatten(structure, leaves)))
+
+        used = export.export(jax.jit(of_leaves))(leaves, scene).module_kept_var_idx
+        numbers = tuple(number for number in used if number < len(leaves))
+        shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
+        return _Leaves(numbers, structure, shapes)
 
     def arguments(
         self, fixed: int, start: int, size: int
@@ -217,6 +268,41 @@ class _Calls:
         system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
         shapes = jax.tree.leaves(jax.eval_shape(run_scene, system, scene))
         return WORKSPACE * sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Leaves:
+    """Takes some arrays of a frame's result, by their numbers."""
+
+    numbers: tuple[int, ...]
+    structure: Any
+    """Of all arrays of a result."""
+    shapes: tuple[tuple[tuple[int, ...], str], ...]
+    """Of these of a clip, and their types."""
+
+    def __call__(self, result: jaxik.Result) -> list[Array]:
+        leaves = jax.tree.leaves(result)
+        return [leaves[number] for number in self.numbers]
+
+    def result(self, kept: Sequence[Array]) -> jaxik.Result:
+        """The result of a clip, with zeros in place of the other arrays."""
+        leaves = [jnp.zeros(*shape) for shape in self.shapes]
+        for number, leaf in zip(self.numbers, kept, strict=True):
+            leaves[number] = leaf
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _measured(
+    measure: Measure, keep: _Leaves, stacked: Stacked, scene: Scene, kept: list[Array]
+) -> dict[str, Array]:
+    """The measures of results, of which only some arrays are there."""
+
+    def of_one(scene: Scene, kept: list[Array]) -> dict[str, Array]:
+        return dict(measure(scene, keep.result(kept)))
+
+    of_scene = None if stacked is None else shared_world.labelled(scene, stacked, 0)
+    return lanes(of_one, in_axes=(of_scene, 0))(scene, kept)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
