@@ -11,16 +11,18 @@ import ctypes
 import dataclasses
 import functools
 import hashlib
+import operator
 import os
 import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Int, PyTree
 
 import jaxik
@@ -43,7 +45,7 @@ ALIGNMENT = 64  # bytes, of results: lines of the cache
 BUILDING = threading.Lock()  # several threads may need the same code
 STRUCTS = ("parameters", "rig", "terrain", "frame")
 
-Axes: TypeAlias = tuple[Any, Any, Any, Any]
+Axes: TypeAlias = tuple[PyTree, PyTree, PyTree, PyTree]
 """Of system, rig, terrain and frames: as `in_axes` of `jaxik.lanes`."""
 
 
@@ -193,11 +195,11 @@ class _Call:
         return cls(trees, axes, arrays, sizes.pop(), starts, each, keep, checked)
 
 
-def _is_none(axis: Any) -> bool:
+def _is_none(axis: int | None) -> bool:
     return axis is None
 
 
-def _leaf_axes(axes: Any, tree: PyTree) -> tuple[int | None, ...]:
+def _leaf_axes(axes: PyTree, tree: PyTree) -> tuple[int | None, ...]:
     """The axis of each leaf, from axes of leaves or of whole subtrees."""
     broadcast = jax.tree.broadcast(axes, tree, is_leaf=_is_none)
     return tuple(jax.tree.structure(tree).flatten_up_to(broadcast))
@@ -240,7 +242,7 @@ def _kernel(call: _Call) -> Kernel:
 
 
 @functools.lru_cache(maxsize=64)
-def _built(structure: Any, shapes: tuple, keep: Keep, checked: bool) -> Kernel | NoKernelError:
+def _built(structure: PyTree, shapes: tuple, keep: Keep, checked: bool) -> Kernel | NoKernelError:
     """The code for arguments of these shapes, or why there is none: neither is looked for again."""
     try:
         return _build(structure, shapes, keep, checked)
@@ -248,7 +250,7 @@ def _built(structure: Any, shapes: tuple, keep: Keep, checked: bool) -> Kernel |
         return error
 
 
-def _build(structure: Any, shapes: tuple, keep: Keep, checked: bool) -> Kernel:
+def _build(structure: PyTree, shapes: tuple, keep: Keep, checked: bool) -> Kernel:
     if toolchain.compiler() is None:
         raise NoKernelError("no C compiler: $CC is not set, and there is no cc")
     leaves = [jax.ShapeDtypeStruct(shape, np.dtype(dtype)) for shape, dtype in shapes]
@@ -305,10 +307,11 @@ def _by_kernel(kernel: Kernel, call: _Call, out_axes: int, cores: int = 1) -> Py
     """The results of compiled code."""
     built, words = kernel.built, {}
     for struct, tree, arrays in zip(STRUCTS, call.trees, call.arrays, strict=True):
-        for field, array in zip(fields_of(tree), arrays, strict=True):
-            words[struct, field.path] = array.astype(np.int32) if field.kind == BOOL else array
+        for path, array in zip(_paths(jax.tree.structure(tree)), arrays, strict=True):
+            words[struct, path] = array.astype(np.int32) if array.dtype == bool else array
+    places = {key: _Leaf.of(array, key[0] == "frame") for key, array in words.items()}
     inputs = [
-        _address(words[place.struct, place.field.path], place.index, place.struct == "frame")
+        places[place.struct, place.field.path].at(place.index)
         for place in (*built.setup, *built.moving)
     ]
     tables = [np.ascontiguousarray(call.arrays[2][number][0, 0]) for number in built.tables]
@@ -321,7 +324,7 @@ def _by_kernel(kernel: Kernel, call: _Call, out_axes: int, cores: int = 1) -> Py
             result = _empty((call.count, *field.shape, call.members), dtype)
             spread = np.moveaxis(result, -1, 0)
         results.append(result)
-        outputs += [_address(spread, index, True) for index in np.ndindex(*field.shape)]
+        outputs += map(_Leaf.of(spread, True).at, np.ndindex(*field.shape))
     _run(kernel, call, np.array(inputs, PLACE), np.array(outputs, PLACE), tables, cores)
     typed = [
         result != 0 if field.kind == BOOL else result
@@ -361,14 +364,33 @@ def _pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
     return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
 
 
-def _address(array: np.ndarray, index: tuple[int, ...], of_frames: bool) -> tuple[int, int, int]:
-    """Where a number is: of the first character and frame, and bytes to those of others."""
-    members, frames, *rest = array.strides
-    at = array.ctypes.data + sum(i * stride for i, stride in zip(index, rest, strict=True))
-    return at, members if len(array) > 1 else 0, frames if of_frames else 0
+class _Leaf(NamedTuple):
+    """Where numbers of an array are that has axes of characters and frames in front."""
+
+    first: int
+    """Address."""
+    strides: tuple[int, ...]
+
+    @classmethod
+    def of(cls, array: np.ndarray, of_frames: bool) -> "_Leaf":
+        members, frames, *rest = array.strides
+        apart = members if len(array) > 1 else 0, frames if of_frames else 0
+        return cls(array.ctypes.data, (*apart, *rest))
+
+    def at(self, index: tuple[int, ...]) -> tuple[int, int, int]:
+        """A `PLACE`: of the first character and frame, and bytes to those of others."""
+        members, frames, *rest = self.strides
+        return self.first + sum(map(operator.mul, index, rest)), members, frames
 
 
-def _empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+@functools.lru_cache(maxsize=64)
+def _paths(structure: PyTree) -> list[tuple[str, ...]]:
+    """The names of the leaves of a tree, as in programs."""
+    zeros = jax.tree.unflatten(structure, [np.zeros(())] * structure.num_leaves)
+    return [field.path for field in fields_of(zeros)]
+
+
+def _empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     """A new array that begins with a line of the cache."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     memory = np.empty(size + ALIGNMENT, np.uint8)
@@ -388,14 +410,14 @@ def _by_lanes(call: _Call, out_axes: int) -> PyTree:
 def _lanes(
     leaves: list,
     starts: Int[ArrayLike, " characters"],
-    structure: Any,
+    structure: PyTree,
     axes: tuple[int | None, ...],
     out_axes: int,
     count: int,
     keep: Keep,
     checked: bool,
 ) -> PyTree:
-    def of_one(leaves: list, start: Any) -> PyTree:
+    def of_one(leaves: list, start: jax.Array) -> PyTree:
         ik, rig, terrain, frames = jax.tree.unflatten(structure, leaves)
         frames = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, count), frames)
         return keep(jaxik.run(ik, rig, terrain, frames, checked=checked))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 from jaxtyping import PyTree
@@ -67,13 +67,13 @@ def _build(
     state = jax.eval_shape(jaxik.init, ik, rig)
 
     def of_frame(
-        ik: jaxik.FootIK, rig: jaxik.Rig, terrain: Any, state: jaxik.State, frame: jaxik.Frame
+        ik: jaxik.FootIK, rig: jaxik.Rig, terrain: Terrain, state: jaxik.State, frame: jaxik.Frame
     ) -> tuple[jaxik.State, PyTree]:
         after, result = jaxik.step(ik, rig, terrain, state, frame, trace=True, checked=checked)
         return after, keep(result)
 
     graph, inputs, tables = Graph(), [], []
-    nodes: dict[str, list[Any]] = {}
+    nodes: dict[str, list] = {}
     for struct, tree in (("parameters", ik), ("rig", rig)):
         nodes[struct] = [input_nodes(graph, inputs, struct, f) for f in fields_of(tree)]
     nodes["terrain"] = []

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 import jaxik
 from fitting.codegen.crowd import Axes, NoKernelError, kernel_of, run_crowd
@@ -201,7 +201,7 @@ class _Calls:
             None if flags is None else shared_world.labelled(tree, flags, 0)
             for tree, flags in zip((ik, scene), stacked, strict=True)
         )
-        of_parts: tuple[Any, Any, Any] = (None, None, None)
+        of_parts: tuple[PyTree, PyTree, PyTree] = (None, None, None)
         if of_scene is not None:
             of_parts = (of_scene.rig, of_scene.terrain, of_scene.frames)
         axes: Axes = (of_ik, *of_parts)
@@ -275,7 +275,7 @@ class _Leaves:
     """Takes some arrays of a frame's result, by their numbers."""
 
     numbers: tuple[int, ...]
-    structure: Any
+    structure: PyTree
     """Of all arrays of a result."""
     shapes: tuple[tuple[tuple[int, ...], str], ...]
     """Of these of a clip, and their types."""
