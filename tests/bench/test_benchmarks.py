@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import subprocess
+import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -20,11 +21,13 @@ from fitting.bench.workloads import Sizes
 from fitting.cli import main
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.codegen import toolchain
+from fitting.codegen.crowd import NoKernelError
 from fitting.inference.optimise.search import find_best_fit
 from fitting.runtime import machine
 from fitting.runtime.threads import usable_cores
 from fitting.viewer.session import DEFAULT
 from jaxik import presets
+from jaxik.world.surfaces import Mesh
 from support.clips import assert_close
 from support.commands import refusal
 from support.problems import problem_of
@@ -390,8 +393,18 @@ def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(mon
     def outputs(ik, crowd, ground, frames):
         return (ik.leg.soften * frames.pose.ankle.pos + ground.up_ws,)
 
+    def by_kernel(crowd, ground, size):
+        if isinstance(ground.surfaces[0], Mesh):
+            raise NoKernelError("the system has a loop")
+        return (lambda: time.sleep(1e-4)), "C, 8 lanes"
+
     monkeypatch.setattr(benchmarks, "_outputs", outputs)
-    of_crowd = figures(measure("crowd"))
+    monkeypatch.setattr(benchmarks.crowds, "by_kernel", by_kernel)
+    timings = measure("crowd")
+    of_crowd = figures(timings)
+    assert of_crowd["heights by C, 8 lanes: leg-frames a second"].value > 0.0
+    assert of_crowd["plane: JAX's CPU time in that of C"].at_least == 3.0
+    assert "mesh by JAX only: the system has a loop" in timings.notes
     wider = 1.0 / measurement.time_in_width()
     assert of_crowd["plane, leg-frames a second"].at_least == pytest.approx(9.0 * wider)
     assert of_crowd["mesh, leg-frames a second"].at_least == pytest.approx(5.0 * wider)
