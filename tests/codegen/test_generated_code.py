@@ -20,16 +20,19 @@ from fitting.clips.clip_frames import frames_from_clip
 from fitting.codegen import (
     c_code,
     c_files,
+    crowd,
+    crowd_program,
     cs_code,
     cs_files,
     export,
     header,
     js_code,
+    lanes_code,
     program,
     stablehlo,
     toolchain,
 )
-from fitting.codegen.graph import DTYPES, Graph
+from fitting.codegen.graph import DTYPES, TABLES, Graph
 from fitting.codegen.toolchain import Compiled, Playback
 from jaxik.maths import parameter_tree, smoothing, vec
 from jaxik.maths.gate import HARD
@@ -151,6 +154,67 @@ def test_generated_javascript_gives_the_answers_of_jaxik_step(tmp_path, walk, hi
     assert largest_difference(results, expected.results) < CLOSE
     assert largest_difference(states, expected.states) < CLOSE
     assert largest_difference(rays, expected.rays) < CLOSE
+
+
+def test_a_crowd_in_lanes_gives_the_answers_of_jaxik_run(walk, hills, unreal, monkeypatch):
+    """Characters that begin with the clip, or where it restarts, beside others that differ."""
+    compiler("c")
+    rig, frames = walk
+    ik, expected = unreal
+    characters, bad, other = 19, 3, 17
+    starts = np.where(np.arange(characters) % 2, 40, 0)
+    weight = np.repeat(np.asarray(frames.weight)[None], characters, axis=0)
+    weight[bad, 45] = np.nan
+    many = dataclasses.replace(frames, weight=weight)
+    speeds = np.where(np.arange(characters) == other, 0.0, 9.0).astype(np.float32)
+    varied = parameter_tree.replace(ik, {"contact.idle_speed": speeds})
+    axes = [
+        jax.tree.map(lambda a, b: None if np.shape(a) == np.shape(b) else 0, *pair)
+        for pair in ((varied, ik), (many, frames))
+    ]
+    arguments = (varied, rig, hills, many, (axes[0], None, None, axes[1]))
+    results = crowd.run_crowd(*arguments, starts=starts, count=20)
+    last = crowd.run_crowd(*arguments, -1, starts=starts, count=20)
+    assert crowd.kernel_of(*arguments).lanes in (4, 8, 16)
+    for a, b in zip(jax.tree.leaves(results), jax.tree.leaves(last), strict=True):
+        np.testing.assert_array_equal(a, np.moveaxis(b, -1, 0))
+    for character, start in enumerate(starts):
+        ours = jax.tree.map(lambda leaf: leaf[character], results)  # noqa: B023
+        theirs = jax.tree.map(lambda leaf: leaf[start : start + 20], expected.results)  # noqa: B023
+        if character == bad:
+            assert ours.faulty[5].all() and ours.faulty.sum() == 2
+            ours, theirs = (jax.tree.map(lambda leaf: leaf[:5], tree) for tree in (ours, theirs))
+        near = largest_difference(ours, theirs) < CLOSE
+        assert near == (character != other), character
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(ours))
+
+
+def test_a_crowd_without_compiled_code_says_why(walk, hills, unreal, monkeypatch):
+    rig, frames = walk
+    ik, _ = unreal
+    many = jax.tree.map(lambda leaf: np.asarray(leaf)[None], frames)
+
+    def reason(ground: Any, frames: jaxik.Frame = many, **options: Any) -> str:
+        with pytest.raises(crowd.NoKernelError) as refused:
+            crowd.kernel_of(ik, rig, ground, frames, **options)
+        return str(refused.value)
+
+    triangle = terrain.mesh(np.float32([[0, 0, 0], [0, 0, 1], [1, 0, 0]]), np.int32([[0, 1, 2]]))
+    doubles = dataclasses.replace(many, weight=many.weight.astype(np.float64))
+    if toolchain.compiler("c"):
+        assert "a loop, 'while'" in reason(triangle)
+    assert "'float64'" in reason(hills, doubles)
+    monkeypatch.setattr(toolchain, "compiler", lambda: None)
+    assert "no C compiler" in reason(hills, checked=True)
+    monkeypatch.setenv(crowd.SWITCH, "0")
+    assert crowd.SWITCH in reason(hills)
+    for options, message in (
+        ({"in_axes": (None,) * 4}, "numbers of characters: []; wanted one"),
+        ({"starts": np.array([3])}, "60 frames from frames 3 to 3 on; the clip has 60"),
+        ({"starts": np.array([0, 0])}, "numbers of characters: [1, 2]"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            crowd.run_crowd(ik, rig, hills, many, **options)
 
 
 @struct
@@ -369,6 +433,18 @@ def test_every_operation_in_javascript_gives_the_answers_of_jax(
     assert differing(outputs.results, expected, exact=1e-6) == {}
 
 
+def test_every_operation_gives_the_answers_of_jax_in_lanes(walk, operands, operations):
+    compiler("c")
+    rows, expected = operands
+    built = crowd_program.of_program(operations, [])
+    frames = jax.tree.map(lambda leaf: leaf[:, None], rows)
+    trees, axes = (operations.ik, walk[0], terrain.plane(), frames), (None, None, None, 0)
+    kernel = crowd.compiled(built)
+    call = crowd._Call.of(trees, axes, None, None, crowd.without_trace, False)
+    outcomes = jax.tree.map(lambda leaf: leaf[:, 0], crowd._by_kernel(kernel, call, 0))
+    assert differing(outcomes, expected) == {}
+
+
 def test_every_rule_is_among_those_operations(operations):
     with jax.enable_x64(False):
         text = program.exported(operated, (operations.trees["frame"],)).mlir_module()
@@ -384,6 +460,8 @@ def test_every_rule_is_among_those_operations(operations):
     }
     for language in (c_code, cs_code, js_code):
         assert set(language.EXPRESSIONS) - used == set(), language
+    of_tables = {key for key in lanes_code.EXPRESSIONS if key[1] in TABLES.values()}
+    assert set(lanes_code.EXPRESSIONS) - of_tables == set(c_code.EXPRESSIONS)
 
 
 def test_constants_are_folded_to_the_answers_of_jax(operands):
