@@ -35,6 +35,7 @@ from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.threads import on_all_cores, usable_cores
 from jaxik import lanes
 from jaxik.maths import parameter_tree
+from jaxik.world.terrain import Terrain
 
 BATCH = "batch"  # the axis of the devices
 MEMORY = 1e9  # bytes that chunks take at once, together
@@ -44,6 +45,7 @@ MEMORY = 1e9  # bytes that chunks take at once, together
 # the ground that they share, 1.21.
 WORKSPACE = 1.5
 CACHED = 64  # systems, or clips, at a time on a core of a CPU
+BY_KERNEL = 1024  # likewise, of C code: a call takes milliseconds, whatever it computes
 Measure: TypeAlias = Callable[[Scene, jaxik.Result], Mapping[str, Float[Array, "*numbers"]]]
 """What is measured of a system on a clip. It must be a function of a module, as a new lambda for
 each call would compile anew. Frames that were not observed should not count: clips get more."""
@@ -181,8 +183,23 @@ class _Calls:
     def _compute(self, fixed: int, start: int, size: int) -> dict[str, np.ndarray]:
         """One chunk."""
         arguments = self.arguments(fixed, start, size)
-        values = self._by_kernel(*arguments) or _along(*arguments)
+        values = (self._by_kernel if self._has_kernel else _along)(*arguments)
         return {name: np.asarray(value) for name, value in values.items()}
+
+    @functools.cached_property
+    def _has_kernel(self) -> bool:
+        """Whether there is C code for it."""
+        scene = self.stack.scenes
+        if self.mesh.size > 1 or scene.frames.dt.dtype != np.float32:
+            return False
+        if scene.tracks or scene.size is not None:
+            return False
+        _, _, stacked, ik, scene = self.arguments(0, 0, 1)
+        try:
+            kernel_of(*_of_run(stacked, ik, scene), keep=self._kept, checked=True)
+        except NoKernelError:
+            return False
+        return True
 
     def _by_kernel(
         self,
@@ -191,27 +208,10 @@ class _Calls:
         stacked: tuple[Stacked, Stacked],
         ik: jaxik.FootIK,
         scene: Scene,
-    ) -> dict[str, Array] | None:
-        """What `_along` gives, of what C code computes; None where there is none for it."""
-        if mesh.size > 1 or scene.frames.dt.dtype != np.float32:
-            return None
-        if scene.tracks or scene.size is not None:
-            return None
-        of_ik, of_scene = (
-            None if flags is None else shared_world.labelled(tree, flags, 0)
-            for tree, flags in zip((ik, scene), stacked, strict=True)
-        )
-        of_parts: tuple[PyTree, PyTree, PyTree] = (None, None, None)
-        if of_scene is not None:
-            of_parts = (of_scene.rig, of_scene.terrain, of_scene.frames)
-        axes: Axes = (of_ik, *of_parts)
+    ) -> dict[str, Array]:
+        """What `_along` gives, of what C code computes."""
         keep = self._kept
-        try:
-            trees = (ik, scene.rig, scene.terrain, scene.frames)
-            kernel_of(*trees, axes, keep=keep, checked=True)
-        except NoKernelError:
-            return None
-        kept = run_crowd(*trees, axes, keep=keep, checked=True, cores=1)
+        kept = run_crowd(*_of_run(stacked, ik, scene), keep=keep, checked=True, cores=1)
         return _measured(measure, keep, stacked[1], scene, kept)
 
     @functools.cached_property
@@ -259,7 +259,7 @@ class _Calls:
             together = usable_cores() if devices == 1 else 1
             wanted = int(self.memory / (together * self._bytes_each()))
             if self.mesh.devices.flat[0].platform == "cpu":
-                wanted = min(wanted, CACHED * devices)
+                wanted = min(wanted, (BY_KERNEL if self._has_kernel else CACHED) * devices)
         wanted = max(1, min(wanted, math.ceil(inner / jax.process_count())))
         return math.ceil(wanted / devices) * devices
 
@@ -268,6 +268,20 @@ class _Calls:
         system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
         shapes = jax.tree.leaves(jax.eval_shape(run_scene, system, scene))
         return WORKSPACE * sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
+
+
+def _of_run(
+    stacked: tuple[Stacked, Stacked], ik: jaxik.FootIK, scene: Scene
+) -> tuple[jaxik.FootIK, jaxik.Rig, Terrain, jaxik.Frame, Axes]:
+    """The arguments of `run_crowd` for systems on a clip, or a system on clips."""
+    of_ik, of_scene = (
+        None if flags is None else shared_world.labelled(tree, flags, 0)
+        for tree, flags in zip((ik, scene), stacked, strict=True)
+    )
+    of_parts: tuple[PyTree, PyTree, PyTree] = (None, None, None)
+    if of_scene is not None:
+        of_parts = (of_scene.rig, of_scene.terrain, of_scene.frames)
+    return ik, scene.rig, scene.terrain, scene.frames, (of_ik, *of_parts)
 
 
 @dataclasses.dataclass(frozen=True)
