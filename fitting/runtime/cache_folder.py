@@ -1,9 +1,10 @@
 """The folder in which programs are cached between processes: where it is, and what lies in it.
 
-It is JAX's folder for compiled programs, with one inside it for the traced ones. JAX (0.10.2 to
-0.12.0.1) writes a compiled program in place, and never again once it is there. A process that reads
-it at that moment warns and compiles for itself; one that is killed at that moment leaves half a
-file, of which every later process warns, and which none replaces. Here each is complete or missing.
+It is JAX's folder for compiled programs, with one inside it for the traced ones and one for what C
+compilers have compiled. JAX (0.10.2 to 0.12.0.1) writes a compiled program in place, and never
+again once it is there. A process that reads it at that moment warns and compiles for itself; one
+that is killed at that moment leaves half a file, of which every later process warns, and which none
+replaces. Here each is complete or missing.
 """
 
 import functools
@@ -26,6 +27,7 @@ TRACED, KERNELS = "traced", "kernels"  # inside JAX's folder
 # Names of complete and of half-written files: of ours, and of JAX's.
 TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*(\.jaxik-\w+-\d+-\w+)?")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)(\.jaxik-\w+-\d+-\w+)?")
+KERNEL_NAMES = re.compile(r"\w+-[0-9a-f]{64}\.so(\.jaxik-\w+-\d+-\w+)?")
 WARNED: set[str] = set()  # problems that this process has warned of
 
 SUFFIX = "-cache"  # of the files' names
@@ -118,8 +120,8 @@ def check_own(path: Path, status: os.stat_result) -> None:
 
 def cached_programs(folder: Path) -> CachedPrograms:
     """The user's own files of programs in a folder, and no others."""
-    traced, compiled = _files(folder / TRACED, TRACED_NAMES), _files(folder, COMPILED_NAMES)
-    return CachedPrograms(list(traced), list(compiled))
+    compiled = _files(folder, COMPILED_NAMES), _files(folder / KERNELS, KERNEL_NAMES)
+    return CachedPrograms(list(_files(folder / TRACED, TRACED_NAMES)), [*compiled[0], *compiled[1]])
 
 
 def used_folder() -> Path:

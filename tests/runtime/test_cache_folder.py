@@ -15,6 +15,7 @@ from fitting.runtime import cache_folder
 from fitting.runtime.cache_folder import (
     ENABLED,
     FOLDER,
+    KERNELS,
     MIN_SECONDS,
     TRACED,
     SwitchedOffError,
@@ -124,15 +125,17 @@ def test_only_cached_programs_of_this_user_count_as_such(tmp_path, monkeypatch):
     names = [f"run-{DIGEST}", f"_evaluate-{DIGEST}", f".run-{DIGEST}x_1ab", f".run-{DIGEST}{half}"]
     traced = [tmp_path / TRACED / name for name in names]
     names = [f"{kept}-atime", f"{kept}-cache", f".{kept}-cache{half}"]
+    names += [f"{KERNELS}/crowd-{DIGEST}.so"]
     compiled = [tmp_path / name for name in names]
     names = ["notes.txt", kept, "jit_step-0123-cache", f"other/{kept}-cache"]
-    names += [f"{TRACED}/notes.txt", f"{TRACED}/deeper/run-{DIGEST}"]
+    names += [f"{KERNELS}/crowd.so", f"{TRACED}/notes.txt", f"{TRACED}/deeper/run-{DIGEST}"]
     others = [tmp_path / name for name in names]
     for path in (*traced, *compiled, *others):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     (tmp_path / TRACED / f"link-{DIGEST}").symlink_to(others[0])
-    assert cache_folder.cached_programs(tmp_path) == (sorted(traced), sorted(compiled))
+    compiled = [*sorted(compiled[:-1]), compiled[-1]]
+    assert cache_folder.cached_programs(tmp_path) == (sorted(traced), compiled)
     assert cache_folder.cached_programs(tmp_path / "none") == ([], [])
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
     assert cache_folder.cached_programs(tmp_path) == ([], [])
