@@ -433,8 +433,15 @@ def test_every_operation_in_javascript_gives_the_answers_of_jax(
     assert differing(outputs.results, expected, exact=1e-6) == {}
 
 
-def test_every_operation_gives_the_answers_of_jax_in_lanes(walk, operands, operations):
+@pytest.mark.parametrize(
+    "lanes", [None, *(pytest.param(count, marks=pytest.mark.slow) for count in (4, 8))]
+)
+def test_every_operation_gives_the_answers_of_jax_in_lanes(
+    lanes, walk, operands, operations, monkeypatch
+):
     compiler("c")
+    if lanes is not None:  # narrower vectors than this processor's
+        monkeypatch.setattr(crowd, "LANES", dict.fromkeys(crowd.LANES, lanes))
     rows, expected = operands
     built = crowd_program.of_program(operations, [])
     frames = jax.tree.map(lambda leaf: leaf[:, None], rows)
