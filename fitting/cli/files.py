@@ -311,6 +311,8 @@ def _export_code(options: argparse.Namespace) -> None:
 
     if options.drop:
         raise ValueError("--drop: only for a record and for settings; code holds everything")
+    if options.form == "js" and options.axes is not None:
+        raise ValueError("--axes: only for C and C#; pages have our axes")
     if options.trace is None and options.terrain is not None:
         raise ValueError("--terrain: the ground under a clip; wanted --trace CLIP as well")
     if options.trace is not None and options.legs is not None:
