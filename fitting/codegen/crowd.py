@@ -29,6 +29,7 @@ import jaxik
 from fitting.runtime import activity, cache_folder, files, machine
 from fitting.runtime.threads import on_all_cores, usable_cores
 from fitting.runtime.validation import in_one_line
+from jaxik.world.surfaces import Mesh
 from jaxik.world.terrain import LegTerrains, Terrain
 
 from . import crowd_program, toolchain
@@ -223,6 +224,10 @@ def _kernel(call: _Call) -> Kernel:
         raise NoKernelError(f"{SWITCH} is 0")
     if jax.default_backend() != "cpu":
         raise NoKernelError("an accelerator computes")
+    grounds = (call.trees[2], *getattr(call.trees[2], "legs", ()))
+    surfaces = (getattr(each, "surface", each) for ground in grounds for each in ground.surfaces)
+    if any(isinstance(surface, Mesh) for surface in surfaces):
+        raise NoKernelError("rays onto meshes have a loop")  # tracing would say so, seconds later
     arrays = [array for part in call.arrays for array in part]
     types = {array.dtype for array in arrays}
     if types - {np.dtype(dtype) for dtype in DTYPES.values()}:

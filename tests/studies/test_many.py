@@ -274,6 +274,9 @@ def test_data_of_32_bits_are_evaluated_by_c_code_alike(problem, ik, systems, cli
     flat = [dataclasses.replace(s, terrain=plane(normal=(0.1, 1.0, 0.0))) for s in problem.data]
     data = with_floats(flat[:clips], jnp.float32)
     batch = fitting.vary(ik, {"pelvis.on_gain": GAINS[:systems]})
+    fitting.evaluate_many(batch, data, chunk=3)
+    assert not calls  # too little for code to pay
+    monkeypatch.setattr(evaluation, "WORTH", 0)
     ours = fitting.evaluate_many(batch, data, chunk=3)
     count = len(calls)
     assert count or toolchain.compiler("c") is None

@@ -45,6 +45,9 @@ MEMORY = 1e9  # bytes that chunks take at once, together
 # the ground that they share, 1.21.
 WORKSPACE = 1.5
 CACHED = 64  # systems, or clips, at a time on a core of a CPU
+# Legs times frames, of all systems and clips, from which C code pays: it is written anew in each
+# process, in seconds, where JAX's programs are cached, and saves a second in about 16 million.
+WORTH = 5e7
 BY_KERNEL = 1024  # likewise, of C code: a call takes milliseconds, whatever it computes
 Measure: TypeAlias = Callable[[Scene, jaxik.Result], Mapping[str, Float[Array, "*numbers"]]]
 """What is measured of a system on a clip. It must be a function of a module, as a new lambda for
@@ -105,8 +108,8 @@ def evaluate_many(
     `jaxik.run` returns for it; on a CPU at most 64 for each device. With several processes
     (`jax.distributed.initialize`) each computes its part, and all get everything.
 
-    Where the arrays of the clips have 32 bits (`with_floats`) and there is a C compiler, systems
-    run as `fitting.run_crowd` runs them, on any ground but meshes.
+    Where the arrays of the clips have 32 bits (`with_floats`) and there is a C compiler, large work
+    runs as `fitting.run_crowd` runs it, on any ground but meshes.
 
     Args:
         ik_batch: systems, with an axis for them in front of each array; where its length is 1, all
@@ -186,13 +189,19 @@ class _Calls:
         values = (self._by_kernel if self._has_kernel else _along)(*arguments)
         return {name: np.asarray(value) for name, value in values.items()}
 
+    @property
+    def _leg_frames(self) -> int:
+        """How many there are, of all systems and clips."""
+        frames, legs = self.stack.scenes.frames.weight.shape[-2:]
+        return self.count * len(self.stack.members) * frames * legs
+
     @functools.cached_property
     def _has_kernel(self) -> bool:
         """Whether there is C code for it."""
         scene = self.stack.scenes
         if self.mesh.size > 1 or scene.frames.dt.dtype != np.float32:
             return False
-        if scene.tracks or scene.size is not None:
+        if scene.tracks or scene.size is not None or self._leg_frames < WORTH:
             return False
         _, _, stacked, ik, scene = self.arguments(0, 0, 1)
         try:
