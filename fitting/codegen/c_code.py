@@ -13,11 +13,11 @@ from .functions import (
     inputs_of,
     parts_of,
     phase_name,
-    routine_of,
+    routine_lines,
 )
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .program import Place, Program
-from .routines import PLATFORM, Routine, routines
+from .routines import PLATFORM, Routine
 from .schedule import Schedule, Target
 
 C_TYPES = {FLOAT: "float", INT: "int", UNSIGNED: "unsigned", BOOL: "int"}
@@ -244,9 +244,6 @@ class C(Language):
         heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
         return f"@APART static void {name}({heads}) {{\n{body}\n}}", names
 
-    def routine(self, routine: Routine, lines: Sequence[str]) -> str:
-        return f"{routine_head(routine)} {{\n{body_of(lines)}\n}}"
-
     def shared(
         self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]
     ) -> str:
@@ -254,14 +251,17 @@ class C(Language):
         return f"@APART static {C_TYPES[kind]} {name}({heads}) {{\n{body_of(lines)}\n}}"
 
 
-def functions(program: Program, schedule: Schedule) -> list[str]:
+def functions(program: Program, schedule: Schedule, routines: Sequence[Routine]) -> list[str]:
     """The helpers, the parts of all phases, and the functions that others call.
 
     Raises:
         ValueError: an operation on a type for which there is no expression.
     """
     parts = parts_of(program, schedule, C())
-    around = [routine_of(routine, C()) for routine in routines(program)]
+    around = [
+        f"{routine_head(routine)} {{\n{body_of(routine_lines(routine, C()))}\n}}"
+        for routine in routines
+    ]
     bodies = "".join([*parts.texts, *around])
     return [*helpers_in(C(), bodies), *parts.texts, *_entries(parts.calls), *around]
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from . import c_code, header
 from .functions import fill
 from .program import Program
+from .routines import routines
 
 FOLDER = Path(__file__).parent
 CHECK, WALK = "check.c", "walk.c"
@@ -14,11 +15,11 @@ NODES = {"unreal": ("unreal.h", "AnimNode_@Name.h"), "godot": ("godot.cpp", "@fi
 
 def sources(program: Program, name: str, engine: str | None = None) -> dict[str, str]:
     """The header, the functions and the node of an engine; see `export.Language`."""
-    schedule = program.schedule()
+    schedule, around = program.schedule(), routines(program)
     constants = "\n\n".join(header.constants(program))
-    parts = [c_code.PRELUDE + constants, *c_code.functions(program, schedule)]
+    parts = [c_code.PRELUDE + constants, *c_code.functions(program, schedule, around)]
     contents = {
-        "@file.h": header.text(program, schedule, engine),
+        "@file.h": header.text(program, schedule, around, engine),
         "@file.c": "\n\n".join(parts) + "\n",
     }
     if engine in NODES:

@@ -15,7 +15,7 @@ from .functions import (
     inputs_of,
     parts_of,
     phase_name,
-    routine_of,
+    routine_lines,
 )
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .program import Field, Place, Program
@@ -210,7 +210,10 @@ def functions(program: Program, schedule: Schedule) -> Code:
     """
     language = CSharp()
     parts = parts_of(program, schedule, language)
-    around = [(routine, routine_of(routine, language)) for routine in routines(program)]
+    around = [
+        (routine, language.routine(routine, routine_lines(routine, language)))
+        for routine in routines(program)
+    ]
     bodies = "".join([*parts.texts, *(text for _, text in around)])
     helpers = helpers_in(language, bodies)
     return Code(list(_entries(parts.calls)), around, [*parts.texts, *helpers])

@@ -56,10 +56,6 @@ class Language(abc.ABC):
         """A function without a result, and the arguments that it has to be given."""
 
     @abc.abstractmethod
-    def routine(self, routine: Routine, lines: Sequence[str]) -> str:
-        """A function that others call."""
-
-    @abc.abstractmethod
     def shared(
         self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]
     ) -> str:
@@ -137,8 +133,8 @@ def fill(template: str, fillings: Mapping[str, str]) -> str:
     return functools.reduce(lambda text, pair: text.replace(*pair), fillings.items(), template)
 
 
-def routine_of(routine: Routine, language: Language) -> str:
-    """A routine in a language.
+def routine_lines(routine: Routine, language: Language) -> list[str]:
+    """The lines of a routine.
 
     Raises:
         ValueError: an operation on a type for which there is no expression.
@@ -146,7 +142,7 @@ def routine_of(routine: Routine, language: Language) -> str:
     graph = routine.graph
     nodes = sorted(needed(graph, [node for _, node in routine.targets]))
     part = Part([node for node in nodes if not is_free(graph, node)], routine.targets)
-    return language.routine(routine, _Function(routine, language, part, Repeats([], {})).write())
+    return _Function(routine, language, part, Repeats([], {})).write()
 
 
 def body_of(lines: Sequence[str]) -> str:

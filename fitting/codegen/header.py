@@ -1,7 +1,7 @@
 """The header of a program in C: structs with units and meanings, and the parameters' values."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -23,13 +23,15 @@ from .meanings import (
     use,
 )
 from .program import Field, Members, Program, constants_of, members_of
-from .routines import routines
+from .routines import Routine
 from .schedule import Schedule
 
 FAST_MATH = " Do not compile with -ffast-math."
 
 
-def text(program: Program, schedule: Schedule, engine: str | None) -> str:
+def text(
+    program: Program, schedule: Schedule, routines: Sequence[Routine], engine: str | None
+) -> str:
     """The header; each @ stands for the prefix of all names, and @NAME for it in capitals."""
     guard, rounds = "@NAME_H", len(program.rounds)
     counts = {"LEGS": program.legs, "RAYS": program.ray_count, "ROUNDS": rounds}
@@ -66,7 +68,7 @@ def text(program: Program, schedule: Schedule, engine: str | None) -> str:
         "",
         *(
             line
-            for routine in routines(program)
+            for routine in routines
             for line in (*comment([routine.meaning]), f"{routine_head(routine)};", "")
         ),
         *(_axes(engine) if engine else ()),

@@ -22,7 +22,7 @@ from .functions import (
     inputs_of,
     parts_of,
     phase_name,
-    routine_of,
+    routine_lines,
 )
 from .graph import BOOL, FLOAT, INT, UNSIGNED, Number
 from .meanings import AXES, BLANK_FRAME, STRUCTS, comment, meanings, origin
@@ -235,7 +235,8 @@ def sources(program: Program, name: str, engine: str | None = None) -> dict[str,
         raise ValueError("axes: only for C and C#")
     schedule, language = program.schedule(), JavaScript(program)
     around = [*routines(program)]
-    code = [*functions(program, schedule), *(routine_of(routine, language) for routine in around)]
+    code = functions(program, schedule, language)
+    code += [language.routine(each, routine_lines(each, language)) for each in around]
     names = [*entry_names(program), *(routine.name for routine in around)]
     parts = [
         "\n".join(comment(_head(program))),
@@ -251,8 +252,8 @@ def sources(program: Program, name: str, engine: str | None = None) -> dict[str,
 
 def script(program: Program) -> str:
     """A program as the object `system` of a script, in short."""
-    schedule = program.schedule()
-    code = functions(program, schedule)
+    schedule, language = program.schedule(), JavaScript(program)
+    code = functions(program, schedule, language)
     ends = np.cumsum([0, *(len(rays) for rays in program.rounds)]).tolist()
     *rays, _ = entry_names(program)[1:]
     sizes = {name: len(program.places[name]) for name in ("rig", "state", "result")}
@@ -260,7 +261,7 @@ def script(program: Program) -> str:
     arrays = [f"{name}: new Float64Array({size})" for name, size in sizes.items()]
     arrays.append(f"work: {memory(schedule, sizes['state'])}")
     parts = [
-        *helpers_in(JavaScript(program), "".join(code)),
+        *helpers_in(language, "".join(code)),
         *code,
         f"return {{ init, step, rays: [{', '.join(rays)}], ends: {ends}, RAY_SIZE: {RAY_SIZE}, "
         f"HIT_SIZE: {hit_size(program)}, create: () => ({{ {', '.join(arrays)} }}) }};",
@@ -278,13 +279,13 @@ def check(program: Program, name: str) -> dict[str, str]:
     return {CHECK: fill(template, {"@CALLS": in_order, "@NAMES": names, "@file": name, "@": ""})}
 
 
-def functions(program: Program, schedule: Schedule) -> list[str]:
+def functions(program: Program, schedule: Schedule, language: JavaScript) -> list[str]:
     """The parts of all phases, and the functions that others call.
 
     Raises:
         ValueError: an operation on a type for which there is no expression.
     """
-    parts = parts_of(program, schedule, JavaScript(program))
+    parts = parts_of(program, schedule, language)
     return [*parts.texts, *_entries(parts.calls)]
 
 

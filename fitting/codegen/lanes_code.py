@@ -14,7 +14,6 @@ from .functions import LETTERS, Language, body_of, fill, parts_of
 from .graph import BOOL, FLOAT, INT, TABLES, UNSIGNED, Number
 from .ordering import without_waiting
 from .program import Place, Program
-from .routines import Routine
 from .schedule import Target
 
 TEMPLATE, VECTORS = (Path(__file__).with_name(name) for name in ("crowd.c", "vectors.h"))
@@ -145,9 +144,6 @@ class Lanes(Language):
         names = [word for word in ARGUMENTS if re.search(rf"\b{word}(->|\[)", body)]
         heads = ", ".join(ARGUMENTS[word] for word in names) or "void"
         return f"APART void {name}({heads}) {{\n{body}\n}}", names
-
-    def routine(self, routine: Routine, lines: Sequence[str]) -> str:
-        raise NotImplementedError("a crowd has no routines")
 
     def shared(
         self, name: str, kind: str, arguments: Sequence[tuple[str, str]], lines: Sequence[str]

@@ -25,7 +25,6 @@ from fitting.codegen import (
     cs_code,
     cs_files,
     export,
-    header,
     js_code,
     lanes_code,
     program,
@@ -383,7 +382,7 @@ def operations(operands, walk) -> program.Program:
 @pytest.fixture
 def no_routines(monkeypatch):
     """As of frames that are rows of operands."""
-    for module in (c_code, cs_code, header, js_code):
+    for module in (c_files, cs_code, js_code):
         monkeypatch.setattr(module, "routines", lambda program: [])
 
 
