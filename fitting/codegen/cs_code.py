@@ -171,6 +171,7 @@ class CSharp(Language):
         return f"{APART}\nstatic void {name}({heads}) {{\n{body}\n}}", names
 
     def routine(self, routine: Routine, lines: Sequence[str]) -> str:
+        """A function that others call."""
         name, kind = routine.writes.name, pascal(routine.writes.struct)
         is_read = routine.writes in routine.reads
         heads = [

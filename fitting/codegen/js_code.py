@@ -208,6 +208,7 @@ class JavaScript(Language):
         return f"function {name}({', '.join(names)}) {{\n{body}\n}}", names
 
     def routine(self, routine: Routine, lines: Sequence[str]) -> str:
+        """A function that others call."""
         names = [name for name, _ in routine.reads if name != routine.writes.name]
         heads = ", ".join([*names, routine.writes.name])
         meaning = "\n".join(comment([routine.meaning]))
