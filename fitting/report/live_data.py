@@ -76,8 +76,6 @@ class LiveClip:
     rig: jaxik.Rig
     terrain: Terrain
     observed: Bool[np.ndarray, " frames"]
-    visible: float
-    """m, depth from which on a sole is marked as in the ground."""
     systems: Mapping[str, LiveSystem]
     """By the keys of their motions in the view."""
     captured: str = ""
@@ -149,7 +147,6 @@ def _pack(live: LiveClip, corner: np.ndarray, known: set[str]) -> Content:
         "surfaces": surfaces,
         "observed": packed(live.observed.astype("u1")),
         "anchors": _anchors(live.animated),
-        "visible": live.visible,
         "reach": STEP * body.ratio(live.rig),
         "captured": live.captured,
     }

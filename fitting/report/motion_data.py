@@ -26,6 +26,8 @@ MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 add
 MAX_GROUND_BYTES = 900_000  # of these, of the grounds
 LARGEST = 32_767  # of a 16-bit integer
 HOLE = 65_535  # in place of a height, where there is no ground
+TENTH = 1e-4  # m, in steps of which gaps are rounded
+NO_GAP = -32_768  # in place of a gap, where there is no ground below a sole
 
 
 class Appearance(NamedTuple):
@@ -121,7 +123,7 @@ def _ground_bytes(ground: GroundPatch) -> int:
 
 def _motion_bytes(motion: PlacedMotion) -> int:
     frames, legs = motion.in_ground.shape
-    return 2 * _points(motion).size + frames * (12 + legs)
+    return 2 * _points(motion).size + frames * (12 + 2 * legs)
 
 
 def _corner(clip: ViewedClip, ground: GroundPatch) -> np.ndarray:
@@ -145,6 +147,7 @@ def _pack_clip(
         "forward": _travel(reference.positions_ws[:, reference.rig.pelvis]),
         "stance": _bytes(_any_of(clip.stance, step)),
         "watched": clip.watched,
+        "visibleDepth": float(clip.reference.measures.visible),
         "skeletons": [
             {
                 "key": key,
@@ -185,7 +188,7 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
         "quantum": quantum,
         "root": _base64((root - corner).astype("<f4")),
         "offsets": _base64(np.round(offsets / quantum).astype("<i2")),
-        "inGround": _bytes(_any_of(motion.in_ground, step)),
+        "gap": _base64(_rounded_gaps(motion.soles.gap, step)),
     }
 
 
@@ -223,6 +226,14 @@ def _travel(pelvis: np.ndarray) -> list[float]:
     furthest = offsets[int(np.argmax(np.linalg.norm(offsets, axis=1)))]
     distance = float(np.linalg.norm(furthest))
     return [0.0, 1.0] if distance < 0.2 else (furthest / distance).tolist()
+
+
+def _rounded_gaps(gap: np.ndarray, step: int) -> np.ndarray:
+    """Gaps of every `step`-th frame, as integers; of those up to the next one the lowest counts."""
+    gap = np.pad(gap, [(0, -len(gap) % step), (0, 0)], constant_values=np.nan)
+    lowest = np.fmin.reduce(gap.reshape(-1, step, gap.shape[1]), axis=1)
+    tenths = np.clip(np.round(lowest / TENTH), -LARGEST, LARGEST)
+    return np.where(np.isnan(tenths), NO_GAP, np.nan_to_num(tenths)).astype("<i2")
 
 
 def _any_of(marks: np.ndarray, step: int) -> np.ndarray:

@@ -660,7 +660,6 @@ def live_clip(comparison: Comparison) -> LiveClip:
         rig=rig,
         terrain=moving(animation.terrain, 0) if carried else animation.terrain,
         observed=animation.clip.observed,
-        visible=comparison.animated.measures.visible,
         systems={
             key(name): LiveSystem({"compared": ik}, sliders(ik, rig))
             for name, ik in comparison.solved_by.items()

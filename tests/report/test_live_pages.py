@@ -54,9 +54,7 @@ def live() -> LiveClip:
     """A short walk without systems, on no ground yet."""
     animation = comparisons.walk(1.1)
     clip = animation.clip
-    return LiveClip(
-        clip, animation.frames, clip.rig, animation.terrain, clip.observed, 0.02, systems={}
-    )
+    return LiveClip(clip, animation.frames, clip.rig, animation.terrain, clip.observed, systems={})
 
 
 def overhanging(middle: np.ndarray) -> terrain.Terrain:

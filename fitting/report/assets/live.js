@@ -116,9 +116,9 @@ class LivePanel {
     const ifCurrent = (act) => (event) => worker === this.worker && act(event); // an ended one may still say something
     worker.onmessage = ifCurrent((event) => this.receive(event.data));
     worker.onerror = ifCurrent((event) => this.say(`This browser cannot solve the motion: ${event.message}`));
-    const { frames, step, columns, anchors, visible, reach } = live, { pelvis, soles } = first, { layout } = script, { trunk } = system;
+    const { frames, step, columns, anchors, reach } = live, { pelvis, soles } = first, { layout } = script, { trunk } = system;
     worker.postMessage({ clip: {
-      frames, step, columns, anchors, visible, reach, pelvis, soles, layout, trunk, numbers, measures, surfaces, animated,
+      frames, step, columns, anchors, reach, pelvis, soles, layout, trunk, numbers, measures, surfaces, animated,
       observed: new Uint8Array(observed),
     } });
     return worker;

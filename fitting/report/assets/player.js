@@ -38,7 +38,7 @@ class Player {
   setClip(index) {
     this.index = index;
     this.clip = this.clips[index];
-    this.skeletons = this.clip.skeletons.map((packed) => new Skeleton(packed, this.clip.legs.length));
+    this.skeletons = this.clip.skeletons.map((packed) => new Skeleton(packed, this.clip.legs.length, this.clip.visibleDepth));
     this.stage.setGround(new Ground(this.clip.ground, this.clip.size));
     element("time").max = this.clip.frames - 1;
     this.makeLegend();

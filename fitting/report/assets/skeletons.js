@@ -1,17 +1,19 @@
 // Unpacks what fitting/report/motion_data.py has packed.
 
 const FADE = 0.3; // m inside its edge, for an adult, over which the ground appears
+const NO_GAP = -32768;
 
 function bytesOf(base64) {
   return Uint8Array.from(atob(base64), (character) => character.charCodeAt(0)).buffer;
 }
 
 class Skeleton {
-  constructor(packed, legs) {
-    Object.assign(this, packed);
+  // `visibleDepth`: m, from which on a sole is marked as in the ground.
+  constructor(packed, legs, visibleDepth) {
+    Object.assign(this, packed, { visibleDepth });
     this.root = new Float32Array(bytesOf(packed.root));
     this.offsets = new Int16Array(bytesOf(packed.offsets));
-    this.packedMarks = new Uint8Array(bytesOf(packed.inGround));
+    this.packedGap = Float32Array.from(new Int16Array(bytesOf(packed.gap)), (step) => (step === NO_GAP ? NaN : 1e-4 * step));
     this.show(null);
     this.footBones = new Map(); // leg by bone, "parent-child"
     packed.legs.forEach((joints, leg) => this.footBones.set(`${joints[2]}-${joints[3]}`, leg));
@@ -19,10 +21,10 @@ class Skeleton {
     this.positions = new Float32Array(3 * packed.points);
   }
 
-  // Another motion of this skeleton, `points` in each frame and feet `inGround`; null is its own.
+  // Another motion of this skeleton, `points` in each frame and the `gap` below each sole; null is its own.
   show(solution) {
     this.solution = solution;
-    this.inGround = solution ? solution.inGround : this.packedMarks;
+    this.gap = solution ? solution.gap : this.packedGap;
   }
 
   // A coordinate of a point in a frame, m; `i` is the point's number times 3, plus that of the axis.
@@ -60,7 +62,11 @@ class Skeleton {
   // Which feet are in the ground in the frame that is shown.
   sunkLegs(time) {
     const frame = Math.min(Math.round(time), this.root.length / 3 - 1);
-    return Array.from({ length: this.legCount }, (_, leg) => this.inGround[this.legCount * frame + leg] > 0);
+    return Array.from({ length: this.legCount }, (_, leg) => this.isSunk(frame, leg));
+  }
+
+  isSunk(frame, leg) {
+    return this.gap[this.legCount * frame + leg] < -this.visibleDepth;
   }
 }
 

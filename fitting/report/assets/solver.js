@@ -196,14 +196,14 @@ class Solver {
     Object.assign(this, system.create());
   }
 
-  // Points of the skeleton and feet in the ground, of the frames that the page shows.
+  // Points of the skeleton and the gap below each sole, m, of the frames that the page shows.
   solve(parameters) {
     const { rig, state, work, rays, hits, result } = this;
     rig.set(this.measures);
     system.init(parameters, rig, state);
     const shown = Math.ceil(this.frames / this.step);
     const points = new Float32Array(3 * this.anchors.length * shown);
-    const inGround = new Uint8Array(this.soles.length * shown);
+    const gap = new Float32Array(this.soles.length * shown).fill(NaN);
     this.frameOf.forEach((frame, number) => {
       system.rays.forEach((ask, round) => {
         if (round) ask(parameters, rig, state, frame, hits, work, rays);
@@ -215,9 +215,9 @@ class Solver {
       else system.step(parameters, rig, state, frame, work, result);
       if (number % this.step) return;
       this.place(frame, points, number / this.step);
-      if (this.observed[number]) this.markFeet(points, number / this.step, inGround);
+      if (this.observed[number]) this.measureGaps(points, number / this.step, gap);
     });
-    return { points, inGround };
+    return { points, gap };
   }
 
   // All points of a frame in world space: `animated` has them before foot IK.
@@ -247,8 +247,8 @@ class Solver {
     }
   }
 
-  // Marks the soles of a frame that are visibly in the ground, as `fitting.motion.measures` does.
-  markFeet(points, page, inGround) {
+  // How high the lower end of each sole is over the ground, as `fitting.motion.measures` has it.
+  measureGaps(points, page, gap) {
     const point = (index) => points.subarray(3 * (this.anchors.length * page + index));
     const [px, py, pz] = point(this.pelvis);
     const path = this.ground.height(px, py, pz);
@@ -257,7 +257,8 @@ class Solver {
         const [x, y, z] = point(index);
         return y - this.ground.height(x, Math.max(y, path) + this.reach, z);
       });
-      inGround[this.soles.length * page + leg] = Math.min(...gaps) < -this.visible ? 1 : 0;
+      const known = gaps.filter(Number.isFinite);
+      gap[this.soles.length * page + leg] = known.length ? Math.min(...known) : NaN;
     });
   }
 }

@@ -9,11 +9,11 @@ class Timeline {
     this.svg = svg;
   }
 
-  // First and last frames of stretches in which a leg is marked.
-  static stretches(marks, legs, leg, frames) {
+  // First and last frames of stretches in which a frame is marked.
+  static stretches(isMarked, frames) {
     const stretches = [];
     for (let frame = 0; frame < frames; frame++) {
-      if (!marks[legs * frame + leg]) continue;
+      if (!isMarked(frame)) continue;
       const last = stretches.at(-1);
       if (last && last[1] === frame - 1) last[1] = frame;
       else stretches.push([frame, frame]);
@@ -54,8 +54,8 @@ class Timeline {
       this.element("rect", { class: kind, x, y, width, height: thickness, rx: 1.5 });
     };
     clip.legs.forEach((name, leg) => {
-      for (const stretch of Timeline.stretches(this.stance, legs, leg, clip.frames)) bar(stretch, leg, "stance", 7);
-      for (const stretch of Timeline.stretches(this.watched.inGround, legs, leg, clip.frames)) bar(stretch, leg, "sunk", 5);
+      for (const stretch of Timeline.stretches((frame) => this.stance[legs * frame + leg], clip.frames)) bar(stretch, leg, "stance", 7);
+      for (const stretch of Timeline.stretches((frame) => this.watched.isSunk(frame, leg), clip.frames)) bar(stretch, leg, "sunk", 5);
     });
     const [start, end] = [this.x(this.watched.worst.start), this.x(this.watched.worst.end)];
     this.element("path", { class: "worst", d: `M${start} 9V4H${end}V9` });

@@ -100,7 +100,6 @@ def live_clip(fitted: Fit, number: int, motions: ClipMotions) -> LiveClip:
         rig=scene.rig,
         terrain=scene.terrain,
         observed=fitted.clips[number].base.observed,
-        visible=motions.fitted.measures.visible,
         systems={
             "fitted": LiveSystem({name: own_system(ik, scene) for name, ik in starts.items()}, own)
         },
