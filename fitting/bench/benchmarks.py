@@ -40,7 +40,7 @@ from fitting.runtime import machine
 from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.studies import exports
 from fitting.studies.animations import Animation
-from fitting.viewer import Session, SessionClip, Solver, session, sliders
+from fitting.viewer import Session, SessionClip, Solver, Tuning, session
 from jaxik.stages.effector import Effector
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.leg import LegGoal, SolvedLeg
@@ -696,20 +696,21 @@ def viewed_walk(frame_count: int) -> Session:
 def view(measurement: Measurement, sizes: Sizes) -> None:
     """Solves a clip of 10 s again for other values: motion, feet, overlays and cost."""
     walk = viewed_walk(sizes.frames)
-    solver, ik = Solver(walk), walk.starts[session.DEFAULT]
+    solver, tuning, ik = Solver(walk), Tuning(walk), walk.starts[session.DEFAULT]
     measurement.progress("view: compiling solve")
     start = time.perf_counter()
     solver.solve(ik)
     measurement.compile_s["solve"] = time.perf_counter() - start
     random = np.random.default_rng(0)
-    numbers = [slider for slider in sliders(ik, walk.rig) if not slider.is_switch]
-    chosen = [numbers[i] for i in random.integers(len(numbers), size=DRAGS)]
-    values = [float(random.uniform(slider.low, slider.high)) for slider in chosen]
-    drags = itertools.cycle(zip(chosen, values, strict=True))
+    own = tuning.numbers(ik)
+    numbers = [i for i, slider in enumerate(tuning.sliders) if not slider.is_switch]
+    drags = itertools.cycle(random.choice(numbers, DRAGS))
 
     def solve() -> None:
-        slider, value = next(drags)
-        solver.solve(slider.write(ik, value))
+        moved, number = own.copy(), next(drags)
+        slider = tuning.sliders[number]
+        moved[number] = random.uniform(slider.low, slider.high)
+        solver.solve(tuning.system(moved))
 
     measurement.time_in_turns({"drag": solve})
     seconds = solver.animation.clip.seconds

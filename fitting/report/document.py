@@ -219,7 +219,9 @@ class Document:
         clips: Sequence[Content] = ()
         if self.view is not None:
             clips = self.view.packed or motion_data.pack(self.view.clips, spent)
-        html = pages.render(clips, document=self, sections=sections, pictures=pictures)
+        html = pages.render(
+            "document.html", clips, document=self, sections=sections, pictures=pictures
+        )
         files.write_text(folder / pages.PAGE, html)
         if stored:
             STORED_FILE.write(folder / STORED, _stored(self, clips))

@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
@@ -78,8 +78,6 @@ class LiveClip:
     observed: Bool[np.ndarray, " frames"]
     systems: Mapping[str, LiveSystem]
     """By the keys of their motions in the view."""
-    captured: str = ""
-    """Key of the captured motion; "" where it is not known."""
     has_tracks: bool = False
     """Whether parameters change along the clip."""
 
@@ -134,21 +132,19 @@ def _pack(live: LiveClip, corner: np.ndarray, known: set[str]) -> Content:
         digest = hashlib.sha256(code.encode()).hexdigest()[:16]
         if digest not in known:
             scripts[digest] = {"code": packed(code.encode()), "layout": _layout(program, legs)}
-        systems.append(
-            _pack_system(key, system, program, digest) | {"trunk": _trunk(live, program)}
-        )
+        content = pack_system(key, system, program.places["parameters"], _numbers)
+        systems.append(content | {"script": digest, "trunk": _trunk(live, program)})
     return {
         "scripts": scripts,
         "systems": systems,
         "frames": len(live.observed),
         "columns": doubles(frames).shape[1],
         "numbers": packed_table(doubles(frames)),
-        "measures": _one(live.rig),
+        "measures": packed(_numbers(live.rig).astype("<f8")),
         "surfaces": surfaces,
         "observed": packed(live.observed.astype("u1")),
         "anchors": _anchors(live.animated),
         "reach": STEP * body.ratio(live.rig),
-        "captured": live.captured,
     }
 
 
@@ -176,6 +172,15 @@ def packed(content: bytes | np.ndarray) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
 
 
+def unpacked_doubles(text: str) -> Float[np.ndarray, " numbers"]:
+    """Numbers that a page has sent, in base64.
+
+    Raises:
+        ValueError: they are not.
+    """
+    return np.frombuffer(base64.b64decode(text, validate=True), "<f8")
+
+
 def packed_table(table: Float[np.ndarray, "rows columns"]) -> str:
     """Numbers as 48 bits, column by column: first the last byte of each.
 
@@ -185,9 +190,9 @@ def packed_table(table: Float[np.ndarray, "rows columns"]) -> str:
     return packed(bytes_of[:, LEFT_OUT:].T)
 
 
-def _one(tree: PyTree) -> str:
+def _numbers(tree: PyTree) -> Float[np.ndarray, " numbers"]:
     """The numbers of a struct."""
-    return packed(doubles(jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)).astype("<f8"))
+    return doubles(jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree))[0]
 
 
 def _layout(program: Script, legs: int) -> Content:
@@ -253,28 +258,38 @@ def _anchors(clip: Clip) -> list[tuple[int, int]]:
     return anchors
 
 
-def _pack_system(key: str, system: LiveSystem, program: Script, digest: str) -> Content:
-    starts = program.places["parameters"]
+def pack_system(
+    key: str,
+    system: LiveSystem,
+    place: Mapping[str, int],
+    numbers: Callable[[jaxik.FootIK], Float[np.ndarray, " numbers"]],
+) -> Content:
+    """The sliders of a system, and the values of those to go back to that have as many.
+
+    Args:
+        key: of its motion in the view.
+        system: with its sliders.
+        place: of the first number of each array of parameters among the values.
+        numbers: the values of a system.
+    """
     first = next(iter(system.starts.values()))
     shapes = {slot.name: np.shape(slot.value) for slot in parameter_tree.slots(first)}
 
-    def alike(ik: jaxik.FootIK) -> bool:
-        """Whether a system has as many numbers; others have them for each leg."""
-        pair = [jax.tree.map(np.shape, each) for each in (ik, first)]
-        return jax.tree.structure(ik) == jax.tree.structure(first) and pair[0] == pair[1]
-
     def span(leaf: str) -> list[int]:
-        return [starts[leaf], starts[leaf] + int(np.prod(shapes[leaf], dtype=int))]
+        return [place[leaf], place[leaf] + int(np.prod(shapes[leaf], dtype=int))]
 
     return {
         "key": key,
-        "script": digest,
-        "starts": {name: _one(ik) for name, ik in system.starts.items() if alike(ik)},
+        "starts": {
+            name: packed(numbers(ik).astype("<f8"))
+            for name, ik in system.starts.items()
+            if is_alike(ik, first)
+        },
         "sliders": [
             {
                 "name": slider.name,
                 "leaf": slider.leaf,
-                "at": starts[slider.leaf] + _flat(slider.index, shapes[slider.leaf]),
+                "at": place[slider.leaf] + _flat(slider.index, shapes[slider.leaf]),
                 "low": slider.low,
                 "high": slider.high,
                 "step": slider.step,
@@ -288,6 +303,12 @@ def _pack_system(key: str, system: LiveSystem, program: Script, digest: str) -> 
             for slider in system.sliders
         ],
     }
+
+
+def is_alike(ik: jaxik.FootIK, other: jaxik.FootIK) -> bool:
+    """Whether two systems have the same arrays; some have a number for each leg."""
+    shapes = [jax.tree.map(np.shape, each) for each in (ik, other)]
+    return jax.tree.structure(ik) == jax.tree.structure(other) and shapes[0] == shapes[1]
 
 
 def _flat(index: tuple[int, ...], shape: tuple[int, ...]) -> int:

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from fitting.clips import Clip
 from fitting.ground.ground_path import GroundPatch
+from fitting.motion import measures
 from fitting.motion.measures import PlacedMotion
 from jaxik.world import body
 
@@ -67,6 +69,8 @@ class ViewedClip:
     motions: Mapping[str, ViewedMotion]
     """By a key that is the same in all clips."""
     stance: Bool[np.ndarray, "frames legs"]
+    flat: Clip
+    """The animation at its own speed, beyond which a standing foot slides."""
     ground: GroundPatch
     watched: str
     """Key of the motion that is watched at first."""
@@ -146,7 +150,10 @@ def _pack_clip(
         "legs": list(reference.rig.names),
         "forward": _travel(reference.positions_ws[:, reference.rig.pelvis]),
         "stance": _bytes(_any_of(clip.stance, step)),
+        "flatPath": _base64(_path(clip.flat)[::step].astype("<f4")),
         "watched": clip.watched,
+        "corner": corner.tolist(),
+        "step": step,
         "visibleDepth": float(clip.reference.measures.visible),
         "skeletons": [
             {
@@ -188,7 +195,7 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
         "quantum": quantum,
         "root": _base64((root - corner).astype("<f4")),
         "offsets": _base64(np.round(offsets / quantum).astype("<i2")),
-        "gap": _base64(_rounded_gaps(motion.soles.gap, step)),
+        "gap": _base64(_rounded(_lowest_gaps(motion, step))),
     }
 
 
@@ -228,12 +235,35 @@ def _travel(pelvis: np.ndarray) -> list[float]:
     return [0.0, 1.0] if distance < 0.2 else (furthest / distance).tolist()
 
 
-def _rounded_gaps(gap: np.ndarray, step: int) -> np.ndarray:
-    """Gaps of every `step`-th frame, as integers; of those up to the next one the lowest counts."""
+def solution(motion: PlacedMotion, corner: np.ndarray, step: int) -> dict[str, np.ndarray]:
+    """Another motion of a clip as its page shows one that it has solved: points and gaps, m.
+
+    Args:
+        motion: over all frames.
+        corner: to which places on the page are relative, m.
+        step: how many frames make one on the page.
+    """
+    points = (_points(motion)[::step] - corner).astype("<f4")
+    return {"points": points, "gap": _lowest_gaps(motion, step).astype("<f4")}
+
+
+def _lowest_gaps(motion: PlacedMotion, step: int) -> np.ndarray:
+    """Gaps of every `step`-th frame, m; of those up to the next one the lowest counts."""
+    gap = motion.soles.gap
     gap = np.pad(gap, [(0, -len(gap) % step), (0, 0)], constant_values=np.nan)
-    lowest = np.fmin.reduce(gap.reshape(-1, step, gap.shape[1]), axis=1)
-    tenths = np.clip(np.round(lowest / TENTH), -LARGEST, LARGEST)
+    return np.fmin.reduce(gap.reshape(-1, step, gap.shape[1]), axis=1)
+
+
+def _rounded(gap: np.ndarray) -> np.ndarray:
+    """Gaps as integers."""
+    tenths = np.clip(np.round(gap / TENTH), -LARGEST, LARGEST)
     return np.where(np.isnan(tenths), NO_GAP, np.nan_to_num(tenths)).astype("<i2")
+
+
+def _path(clip: Clip) -> np.ndarray:
+    """How far each ball has gone over the ground since the clip began, m: (frames, legs)."""
+    steps = measures.horizontal_steps(clip.joints_ws(3), clip.cuts)
+    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def _any_of(marks: np.ndarray, step: int) -> np.ndarray:

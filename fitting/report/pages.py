@@ -29,10 +29,16 @@ VIEWER_SCRIPTS = (  # in the order in which they use each other
     "shaders.js",
     "stage.js",
     "camera.js",
+    "figures.js",
     "timeline.js",
-    "player.js",
+    "curves.js",
+    "layers.js",
+    "worker.js",
     "live.js",
+    "player.js",
 )
+PROGRAM_SCRIPTS = ("contacts.js", "program.js")  # of a page that a program serves
+
 COLOURS = {  # of the plots, as variables of the style sheet
     "captured": style.CAPTURED,
     "fitted": style.AFTER,
@@ -44,23 +50,37 @@ MAX_BYTES = 2_500_000  # of all pictures of a page
 SMALLER = 0.8  # of its width, as often as it takes
 
 
-def render(clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
+def render(
+    template: str,
+    clips: Sequence[Mapping[str, Any] | None],
+    *,
+    is_remote: bool = False,
+    **content: Any,
+) -> str:
     """A page as HTML. What is not marked as HTML is escaped.
 
     Args:
+        template: name of its file.
         clips: what the view shows, as `motion_data.pack` gives it; none for a page without a view.
+        is_remote: whether a program serves the page, which solves its clips, and has those that are
+            None.
         content: the template's variables.
     """
-    scripts = (*SCRIPTS, *VIEWER_SCRIPTS) if clips else SCRIPTS
-    template = _environment().get_template("document.html")
-    return template.render(
-        **content,
-        data=as_json({"clips": clips}),
-        is_live=any(clip.get("live") for clip in clips),
-        colours=COLOURS,
-        version=metadata.version("jaxik"),
-        style=Markup(_assets(STYLES)),
-        script=Markup(_assets(scripts)),
+    viewer = (*VIEWER_SCRIPTS, *(PROGRAM_SCRIPTS if is_remote else ()), "page.js")
+    scripts = (*SCRIPTS, *viewer) if clips else SCRIPTS
+    return (
+        _environment()
+        .get_template(template)
+        .render(
+            **content,
+            data=as_json({"clips": clips}),
+            is_remote=is_remote,
+            is_live=any(clip.get("live") for clip in clips if clip),
+            colours=COLOURS,
+            version=metadata.version("jaxik"),
+            style=Markup(_assets(STYLES)),
+            script=Markup(_assets(scripts)),
+        )
     )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 import jaxik
 from fitting.problem.space import FreeParameter
-from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 from jaxik.world.body import exponent, scaled_declarations
 
@@ -71,35 +70,6 @@ class Slider:
         """The value that a system has."""
         value = np.asarray(parameter_tree.get(ik, self.leaf))[self.index]
         return bool(value) if self.is_switch else float(value)
-
-    def clamped(self, ik: jaxik.FootIK) -> float | bool:
-        """The value moved into the range."""
-        value = self.read(ik)
-        return value if self.is_switch else min(max(value, self.low), self.high)
-
-    @in_float64
-    def write(self, ik: jaxik.FootIK, value: float | bool) -> jaxik.FootIK:
-        """The system with another value, moved to where the order of parameters allows it.
-
-        Raises:
-            ValueError: it is outside the range.
-        """
-        if not self.is_switch:
-            if not self.low - self.step <= value <= self.high + self.step:
-                limits = f"{self.low:g} to {self.high:g}"
-                raise ValueError(f"{self.name} is {value:g}; wanted from {limits}")
-            value = min(max(value, self.low), self.high)  # a page rounds what it sends
-            value = self._in_order(ik, value)
-        leaf = np.array(parameter_tree.get(ik, self.leaf))
-        leaf[self.index] = value
-        return parameter_tree.replace(ik, {self.leaf: leaf})
-
-    def _in_order(self, ik: jaxik.FootIK, value: float) -> float:
-        for leaf in self.below:
-            value = min(value, float(np.min(parameter_tree.get(ik, leaf))))
-        if self.above is not None:
-            value = max(value, float(np.max(parameter_tree.get(ik, self.above))))
-        return value
 
 
 def sliders(

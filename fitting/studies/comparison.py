@@ -664,7 +664,6 @@ def live_clip(comparison: Comparison) -> LiveClip:
             key(name): LiveSystem({"compared": ik}, sliders(ik, rig))
             for name, ik in comparison.solved_by.items()
         },
-        captured="" if comparison.captured is None else CAPTURE,
         has_tracks=bool(animation.tracks),
     )
 
@@ -708,6 +707,7 @@ def viewed_clip(
     return ViewedClip(
         motions,
         comparison.animated.clip.stance_labels(),
+        comparison.animation.own_speed,
         ground_path.around_path(highest, comparison.animation.terrain),
         watched=key(watched if watched in comparison.motions else ANIMATED),
         live=live,

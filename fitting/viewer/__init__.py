@@ -1,8 +1,8 @@
 """The live viewer of `jaxik view`: a clip in 3-D, solved again while its parameters are dragged.
 
-Only `page` knows of a browser, and of viser, an extra; only `views`, the job, imports it. `session`
-holds a run, or a clip on its ground; `solving` solves a clip and
-makes what is drawn of it; `tuning` is the history of changes, and how the result is saved.
+`session` holds a run, or a clip on its ground; `solving` solves a clip; `tuning` makes systems of
+the values of sliders, and saves them; `server` serves the page, which is that of reports; `views`
+has the jobs.
 """
 
 from fitting.report.sliders import Slider as Slider

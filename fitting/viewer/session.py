@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 import jaxik
 from fitting.experiment import problems, systems
@@ -30,9 +29,6 @@ from fitting.studies.fit import run_folder
 
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to
 Cost = Callable[[jaxik.FootIK], Float[Array, ""]]
-
-Colour: TypeAlias = tuple[int, int, int]
-"""RGB, 0..255."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ def session_of_run(run: Path) -> Session:
     experiment, summary = run_folder.load_fit(run)
     clips = problems.load_clips(experiment)
     problem = problems.problem_from_clips(experiment, clips)
-    if "noise" in summary:
+    if experiment.noise.moves_optimum:  # only then it is part of what the fit minimised
         problem = with_noise(problem, NoiseModel(**summary["noise"]))
     values = {row["name"]: row["u"] for row in summary["parameters"]}
     u = np.array([values[name] for name in problem.space.names])
@@ -185,48 +181,3 @@ def session_of_animation(
 def with_start(session: Session, name: str, ik: jaxik.FootIK) -> Session:
     """The session with one more system to go back to, with which it begins."""
     return replace(session, starts={name: ik, **session.starts})
-
-
-class Lines(NamedTuple):
-    """Segments in each frame; what is not there in a frame has no length."""
-
-    points: Float[np.ndarray, "frames lines 2 3"]
-    """m, both ends."""
-    colours: UInt8[np.ndarray, "frames lines 2 3"]
-    """RGB of both ends."""
-
-
-def lines(
-    starts: Float[np.ndarray, "frames *n 3"],
-    ends: Float[np.ndarray, "frames *n 3"],
-    colours: Colour | UInt8[np.ndarray, "frames *n 3"],
-) -> Lines:
-    """Lines between points, m, in one colour or a colour for each."""
-    points = np.stack([starts, ends], axis=-2)
-    each = np.broadcast_to(np.asarray(colours, np.uint8), starts.shape)
-    both = np.broadcast_to(each[..., None, :], points.shape)
-    frames = len(points)
-    return Lines(points.reshape(frames, -1, 2, 3), both.reshape(frames, -1, 2, 3).copy())
-
-
-def crosses(
-    points: Float[np.ndarray, "frames n 3"],
-    present: Float[np.ndarray, "frames n"],
-    arm: float,
-    colour: Colour,
-) -> Lines:
-    """A cross of three lines at each point that is present.
-
-    Args:
-        points: m.
-        present: above a half where there is something to show.
-        arm: m, half the length of a line.
-        colour: of all.
-    """
-    arms = arm * np.eye(3) * (present > 0.5)[..., None, None]
-    return lines(points[..., None, :] - arms, points[..., None, :] + arms, colour)
-
-
-def joined(*parts: Lines) -> Lines:
-    """Lines side by side, over the same frames."""
-    return Lines(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))

@@ -1,40 +1,39 @@
 """Solves a clip for any values of a system's parameters, by programs that are compiled once."""
 
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, UInt8
 
 import jaxik
 from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result
-from fitting.motion import measures
-from fitting.motion.measures import VISIBLE, Measures, PlacedMotion, Soles
+from fitting.ground import ground_path
+from fitting.motion.measures import PlacedMotion
 from fitting.motion.playback import stage_outputs
+from fitting.report import motion_data
+from fitting.report.motion_data import ViewedClip, ViewedMotion
 from fitting.runtime.precision import in_float64
 from jaxik.world import body
 from jaxik.world.body import similar
 from jaxik.world.terrain import Hit
 
-from .session import Colour, Lines, Session, crosses, joined, lines
+from .session import Session
 
-IN_GROUND, SLIDES = (230, 30, 30), (214, 39, 214)  # colours, RGB
+Colour: TypeAlias = tuple[int, int, int]
+"""RGB, 0..255."""
 
-SKELETONS: dict[str, Colour] = {  # by name; the colours of reports
-    "before": (140, 140, 140),
-    "after": (0, 114, 178),
-    "captured": (213, 94, 0),
-}
-HEEL, BALL, ANKLE, TOE = range(4)  # corners of a foot as it is drawn
-EDGES = ((ANKLE, HEEL), (HEEL, BALL), (BALL, TOE))
-
+SOLVED = "solved"  # key of the motion that sliders change
 FOUND, MISSED = (0, 158, 115), (150, 150, 150)
 FOOTHOLD, LOCK, TARGET = (0, 114, 178), (230, 159, 0), (204, 61, 130)
 WITHIN, BEYOND = (0, 158, 115), (230, 30, 30)
 ARM = 0.05  # m, half a cross, for an adult
-NAMES = {
+LAYERS = {
     "rays": "Rays, grey where they miss",
     "footholds": "Footholds (blue)",
     "locks": "Locks (orange)",
@@ -43,70 +42,22 @@ NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class FootFaults:
-    """How deep each foot is in the ground, and how far it has slid, in each frame."""
+class Lines(NamedTuple):
+    """Segments in each frame; what is not there in a frame has no length."""
 
-    depth: Float64[np.ndarray, "frames legs"]
-    """m in the ground, 0 above it and without any."""
-    slide: Float64[np.ndarray, "frames legs"]
-    """m, horizontal path of the ball since its stance began, beyond the animated one; 0 in a
-    swing."""
-    size: float = 1.0
-    """Length of the legs relative to an adult's: what is visible is as many times as large."""
-
-    @property
-    def sunk(self) -> Float64[np.ndarray, "frames legs"]:
-        """How far a foot is in the ground, 0..1; 1 where it counts as penetration."""
-        return np.clip(self.depth / (VISIBLE * self.size), 0.0, 1.0)
-
-    @property
-    def slid(self) -> Float64[np.ndarray, "frames legs"]:
-        """How far a standing foot has slid, 0..1; 1 at the bound of a slide."""
-        return np.clip(self.slide / (VISIBLE * self.size), 0.0, 1.0)
-
-    def colours(self, plain: tuple[int, int, int]) -> UInt8[np.ndarray, "frames legs 3"]:
-        """The colour of each foot: plain, the redder the deeper, the more purple the further slid.
-
-        Args:
-            plain: of a foot with nothing wrong, RGB.
-        """
-        colours = np.full((*self.depth.shape, 3), plain, np.float64)
-        for share, colour in ((self.slid, SLIDES), (self.sunk, IN_GROUND)):
-            colours += share[..., None] * (np.array(colour) - colours)
-        return np.round(colours).astype(np.uint8)
-
-
-def foot_faults(feet: Soles, motion: Clip, animated: Clip) -> FootFaults:
-    """How deep and how far the feet of a motion are in the ground and slide.
-
-    Args:
-        feet: of the motion.
-        motion: over the same frames.
-        animated: whose slides are not counted.
-    """
-    depth = np.maximum(-np.nan_to_num(feet.gap), 0.0)
-    slide = np.nan_to_num(measures.travelled(motion, animated, feet.stance))
-    return FootFaults(depth, np.maximum(slide, 0.0), body.ratio(motion.rig))
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """One motion as it is drawn."""
-
-    bones: Lines
-    feet: Lines
-    """Coloured by what is wrong with them."""
-    faults: FootFaults
-    measures: Measures
+    points: Float[np.ndarray, "frames lines 2 3"]
+    """m, both ends."""
+    colours: UInt8[np.ndarray, "frames lines 3"]
+    """RGB."""
 
 
 @dataclass(frozen=True)
 class Solved:
     """What a system makes of a clip."""
 
-    motion: Drawn
-    overlays: dict[str, Lines]
+    motion: PlacedMotion
+    layers: dict[str, Lines]
+    """Those that were wanted."""
     cost: float | None
     """None where no captured motion is known."""
     seconds: float
@@ -125,19 +76,14 @@ class Solver:
         self.session = session
         self.clip = session.clips[number]
         self.animation = self.clip.animation
-        self.before = self._drawn(self.animation.placed_clip, "before")
-        captured = self.animation.captured
-        self.captured = None if captured is None else self._drawn(captured, "captured")
-
-    @property
-    def path_ws(self) -> Float[np.ndarray, "frames 3"]:
-        """Where the animated pelvis is, m."""
-        clip = self.animation.placed_clip
-        return clip.positions_ws[:, clip.rig.pelvis]
 
     @in_float64
-    def solve(self, ik: jaxik.FootIK) -> Solved:
+    def solve(self, ik: jaxik.FootIK, layers: Collection[str] = ()) -> Solved:
         """What a system makes of the clip.
+
+        Args:
+            ik: the system.
+            layers: names of `LAYERS` that are wanted.
 
         Raises:
             ValueError: the poses are not finite.
@@ -150,52 +96,100 @@ class Solver:
         solved = clip_from_result(own.clip, result, floor=own.floor, rise=own.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite")
-        motion, layers = self._drawn(solved, "after"), overlays(result, solved)
-        cost = None if cost is None else float(cost)
-        return Solved(motion, layers, cost, time.perf_counter() - began)
+        lines = overlays(result, solved, layers) if layers else {}
+        motion, cost = own.place(solved), None if cost is None else float(cost)
+        return Solved(motion, lines, cost, time.perf_counter() - began)
 
     @in_float64
-    def _drawn(self, clip: Clip, name: str) -> Drawn:
-        placed = self.animation.place(clip)
-        faults = foot_faults(placed.soles, clip, self.animation.own_speed)
-        bones = np.array([[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0])
-        starts, ends = np.moveaxis(clip.positions_ws[:, bones], 2, 0)
-        feet = _feet(placed, faults.colours(SKELETONS[name]))
-        return Drawn(lines(starts, ends, SKELETONS[name]), feet, faults, placed.measures)
+    def viewed(self) -> ViewedClip:
+        """The clip as the page shows it at first: animation, first system, captured motion."""
+        own, first = self.animation, next(iter(self.session.starts.values()))
+        motions = {
+            "animated": ViewedMotion("flat animation", self._flat, motion_data.ANIMATED, True),
+            SOLVED: ViewedMotion("solved", self.solve(first).motion, motion_data.FITTED, True),
+        }
+        if own.captured is not None:
+            captured = own.place(own.captured)
+            motions["captured"] = ViewedMotion("captured", captured, motion_data.CAPTURED, True)
+        return ViewedClip(
+            motions,
+            self.labelled.stance_labels(),
+            own.own_speed,
+            ground_path.around_path(own.placed_clip, own.terrain),
+            watched=SOLVED,
+        )
+
+    @property
+    def labelled(self) -> Clip:
+        """The motion whose stances the page shows."""
+        own = self.animation
+        return own.clip if own.captured is None else own.captured
+
+    @cached_property
+    def _flat(self) -> PlacedMotion:
+        return self.animation.place(self.animation.placed_clip)
 
 
-def _feet(motion: PlacedMotion, colours: np.ndarray) -> Lines:
-    """The soles of a motion, in a colour for each foot in each frame."""
-    joints = np.stack([motion.clip.joints_ws(2), motion.clip.joints_ws(3)], axis=2)
-    corners = np.concatenate([motion.soles.points_ws, joints], axis=2)
-    return joined(
-        *(lines(corners[:, :, start], corners[:, :, end], colours) for start, end in EDGES)
-    )
-
-
-def overlays(result: jaxik.Result, solved: Clip) -> dict[str, Lines]:
+def overlays(result: jaxik.Result, solved: Clip, names: Collection[str]) -> dict[str, Lines]:
     """What is drawn on demand, by name, in world space.
 
     Args:
         result: of a system.
         solved: the clip as the system leaves it.
+        names: of `LAYERS`.
     """
     trace = stage_outputs(result)
     sensed, advanced = trace.sensed, trace.advanced
     arm = ARM * body.ratio(solved.rig)
     found = np.asarray(sensed.foothold.found)
-    held_ws = np.asarray(advanced.foothold_ws) + np.asarray(advanced.hold.offset_ws)
+    foothold_ws = np.asarray(advanced.foothold_ws)
+    held_ws = foothold_ws + np.asarray(advanced.hold.offset_ws)
     target_ws = np.asarray(advanced.effector.target_ws)
     hits = (sensed.ground.ankle, sensed.ground.toe, sensed.ground.corner)
     up_ws = np.asarray(sensed.leg_up_ws)
     up_ws = up_ws if up_ws.ndim == 3 else up_ws[:, None]
-    return {
-        "rays": joined(*(_rays(hit, up_ws) for hit in hits)),
-        "footholds": crosses(np.asarray(advanced.foothold_ws), found, arm, FOOTHOLD),
-        "locks": crosses(held_ws, np.asarray(advanced.hold.locked), 1.5 * arm, LOCK),
-        "targets": crosses(target_ws, found, arm, TARGET),
-        "reach": _reach(solved, target_ws),
+    makers = {
+        "rays": lambda: joined(*(_rays(hit, up_ws) for hit in hits)),
+        "footholds": lambda: crosses(foothold_ws, found, arm, FOOTHOLD),
+        "locks": lambda: crosses(held_ws, np.asarray(advanced.hold.locked), 1.5 * arm, LOCK),
+        "targets": lambda: crosses(target_ws, found, arm, TARGET),
+        "reach": lambda: _reach(solved, target_ws),
     }
+    return {name: make() for name, make in makers.items() if name in names}
+
+
+def lines(
+    starts: Float[np.ndarray, "frames *n 3"],
+    ends: Float[np.ndarray, "frames *n 3"],
+    colours: Colour | UInt8[np.ndarray, "frames *n 3"],
+) -> Lines:
+    """Lines between points, m, in one colour or a colour for each."""
+    points, frames = np.stack([starts, ends], axis=-2), len(starts)
+    each = np.broadcast_to(np.asarray(colours, np.uint8), starts.shape)
+    return Lines(points.reshape(frames, -1, 2, 3), each.reshape(frames, -1, 3))
+
+
+def crosses(
+    points: Float[np.ndarray, "frames n 3"],
+    present: Float[np.ndarray, "frames n"],
+    arm: float,
+    colour: Colour,
+) -> Lines:
+    """A cross of three lines at each point that is present.
+
+    Args:
+        points: m.
+        present: above a half where there is something to show.
+        arm: m, half the length of a line.
+        colour: of all.
+    """
+    arms = arm * np.eye(3) * (present > 0.5)[..., None, None]
+    return lines(points[..., None, :] - arms, points[..., None, :] + arms, colour)
+
+
+def joined(*parts: Lines) -> Lines:
+    """Lines side by side, over the same frames."""
+    return Lines(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
 
 
 def _rays(hit: Hit, up_ws: np.ndarray) -> Lines:

@@ -1,85 +1,88 @@
-"""The system as it has been moved so far, with a way back."""
+"""The values of all sliders of a session as one list, and how a system is saved."""
 
 import itertools
-import threading
 import warnings
-from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
 
 import jaxik
 from fitting.experiment import parameter_files, record_files
 from fitting.experiment.systems import Preset
+from fitting.report import live_data
+from fitting.report.live_data import LiveSystem
+from fitting.report.sliders import Slider, sliders
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
+from fitting.runtime.validation import Content
 from jaxik import record
+from jaxik.maths import parameter_tree
 
-PAUSE = 1.0  # s, after which moving the same slider is a new step
-MOST_STEPS = 1000  # that can be undone
+from .session import Session
+from .solving import SOLVED
 
 STEM = "tuned"
 
 
 class Tuning:
-    """A system that is changed step by step; calls may come from several threads.
-
-    Moving one slider, without a pause, is one step, however many values it passes.
+    """What the page's sliders change.
 
     Args:
-        starts: the systems to go back to, by name; it begins with the first.
+        session: with the systems to go back to; values are those of systems like the first.
     """
 
-    def __init__(self, starts: Mapping[str, jaxik.FootIK]):
-        self.starts = dict(starts)
-        self._ik = next(iter(self.starts.values()))
-        self._undone: list[jaxik.FootIK] = []
-        self._done: list[jaxik.FootIK] = []
-        self._last: tuple[str, float] = ("", -PAUSE)
-        self._lock = threading.RLock()
+    def __init__(self, session: Session):
+        self._session = session
+        self.first = next(iter(session.starts.values()))
 
-    @property
-    def ik(self) -> jaxik.FootIK:
-        """The system as it is."""
-        with self._lock:
-            return self._ik
+    @cached_property
+    def sliders(self) -> list[Slider]:
+        """All, element by element of each array."""
+        return sliders(self.first, self._session.rig, self._session.free)
 
-    def change(self, ik: jaxik.FootIK, what: str, now: float) -> None:
-        """Takes a changed system.
+    def numbers(self, ik: jaxik.FootIK) -> Float64[np.ndarray, " sliders"]:
+        """The values of a system."""
+        return np.array([slider.read(ik) for slider in self.sliders], np.float64)
 
-        Args:
-            ik: the system.
-            what: has changed: the name of a parameter.
-            now: s, on any clock.
+    @in_float64
+    def system(self, values: Float64[np.ndarray, " sliders"]) -> jaxik.FootIK:
+        """The system with these values.
+
+        Raises:
+            ValueError: there are more or fewer values, or one that is not a number.
         """
-        with self._lock:
-            before, when = self._last
-            if what != before or now - when > PAUSE:
-                self._done = [*self._done, self._ik][-MOST_STEPS:]
-            self._undone, self._ik, self._last = [], ik, (what, now)
+        if values.shape != (len(self.sliders),) or np.isnan(values).any():
+            wanted = f"wanted {len(self.sliders)} numbers, one for each slider"
+            raise ValueError(f"{wanted}; got {values.size}, {np.isnan(values).sum()} of them NaN")
+        arrays: dict[str, np.ndarray] = {}
+        for slider, value in zip(self.sliders, values, strict=True):
+            leaf = slider.leaf
+            if leaf not in arrays:
+                arrays[leaf] = np.array(parameter_tree.get(self.first, leaf))
+            arrays[leaf][slider.index] = value
+        return parameter_tree.replace(self.first, arrays)
 
-    def reset(self, name: str) -> None:
-        """Goes back to one of the systems to go back to, which is a step of its own."""
-        self.change(self.starts[name], f"reset to {name}", float("inf"))
+    @in_float64
+    def content(self) -> Content:
+        """The sliders and the systems to go back to, as the page takes them."""
+        place: dict[str, int] = {}
+        for number, slider in enumerate(self.sliders):
+            place.setdefault(slider.leaf, number)
+        live = LiveSystem(self._session.starts, self.sliders)
+        return {"systems": [live_data.pack_system(SOLVED, live, place, self.numbers)]}
 
-    def undo(self) -> None:
-        """Goes back a step, if there is one."""
-        self._move(self._done, self._undone)
+    @in_float64
+    def packed(self, ik: jaxik.FootIK) -> str:
+        """The values of a system like the first, as the page takes them.
 
-    def redo(self) -> None:
-        """Does the step again that was undone last, if there is one."""
-        self._move(self._undone, self._done)
-
-    def _move(self, source: list[jaxik.FootIK], target: list[jaxik.FootIK]) -> None:
-        with self._lock:
-            if source:
-                target.append(self._ik)
-                self._ik = source.pop()
-                self._last = ("", -PAUSE)
-
-    def restart(self, name: str, ik: jaxik.FootIK) -> None:
-        """Begins anew with a system to go back to, as a fit that goes on finds better ones."""
-        with self._lock:
-            self.starts, self._ik = {**self.starts, name: ik}, ik
-            self._done, self._undone, self._last = [], [], ("", -PAUSE)
+        Raises:
+            ValueError: it has other parameters.
+        """
+        if not live_data.is_alike(ik, self.first):
+            raise ValueError("the system has other parameters than the one that is shown")
+        return live_data.packed(self.numbers(ik).astype("<f8"))
 
 
 @in_float64

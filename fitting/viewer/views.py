@@ -3,11 +3,9 @@
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import jaxik
 from fitting import viewer
@@ -16,25 +14,15 @@ from fitting.inference.optimise.solution import Report
 from fitting.problem.capture_system import alone
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
+from fitting.viewer.server import HERE, Address, Server, Viewer
 
-EXTRA = 'needs viser: pip install "jaxik[view]"'
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 BEST = "best so far"
 EVERY = 0.5  # s, at least, between two points of a fit that are drawn
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where the page is served."""
-
-    host: str = LOOPBACK[0]
-    port: int = 8080
-    """The next free one is taken where this is in use; 0 for any."""
-
-
 @contextmanager
-def opened(session: viewer.Session, folder: Path, address: Address = Address()) -> Iterator[Any]:
-    """A `fitting.viewer.page.Viewer` while it is open.
+def opened(session: viewer.Session, folder: Path, address: Address = HERE) -> Iterator[Server]:
+    """The server of a page while it is open; it has a `viewer`.
 
     Args:
         session: what is viewed.
@@ -42,29 +30,21 @@ def opened(session: viewer.Session, folder: Path, address: Address = Address()) 
         address: of the page.
 
     Raises:
-        ValueError: viser is not installed, or the address or the folder does not exist.
+        ValueError: the address or the folder does not exist.
     """
     check_folder(folder)
-    page = _page()
-    with ExitStack() as stack:
-        server = page.open_server(
-            address.host, address.port, own_pages_only=address.host in LOOPBACK
-        )
-        stack.callback(page.stop, server)
-        with activity.announced("Preparing the page"):
-            viewer_page = page.Viewer(server, session, folder)
-        stack.callback(viewer_page.close)
-        activity.log(f"{session.title}: open {page.address(server)} in a browser")
-        if address.host not in LOOPBACK:
+    with closing(Server(Viewer(session, folder), address)) as server:
+        activity.log(f"{session.title}: open {server.url} in a browser")
+        if not address.is_local:
             note = f"note: whoever reaches {address.host} can move sliders, and save into {folder}"
             activity.log(note)
-        yield viewer_page
+        yield server
 
 
 def view(
     session: viewer.Session,
     folder: str | Path,
-    address: Address = Address(),
+    address: Address = HERE,
     *,
     until: threading.Event | None = None,
 ) -> None:
@@ -82,7 +62,7 @@ def view(
         activity.log("")
 
 
-def view_run(run: str | Path, folder: str | Path | None, address: Address = Address()) -> None:
+def view_run(run: str | Path, folder: str | Path | None, address: Address = HERE) -> None:
     """Shows the clips of a run; Save writes into its folder, unless another one is named.
 
     Raises:
@@ -97,9 +77,8 @@ def check_folder(folder: Path) -> None:
     """Checks, before anything is computed, that Save can write.
 
     Raises:
-        ValueError: viser is not installed, or there is no such folder.
+        ValueError: there is no such folder.
     """
-    _page()
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder, in which to save; make it, or name another")
 
@@ -115,14 +94,13 @@ class FitWatch(activity.Watcher):
 
     folder: Path
     address: Address
-    viewer: Any = field(default=None, repr=False)
-    """The `fitting.viewer.page.Viewer`, once there is one."""
+    server: Server | None = field(default=None, repr=False)
+    """Once there is one."""
     _page: ExitStack = field(default_factory=ExitStack, repr=False)
     _problem: Problem[jaxik.FootIK] | None = field(default=None, repr=False)
     _last: tuple[float, float] = (float("inf"), float("-inf"))  # cost, and when it was drawn
 
     def __enter__(self) -> "FitWatch":
-        _page()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -137,11 +115,11 @@ class FitWatch(activity.Watcher):
                 self.folder,
                 self.address,
             )
-            self.viewer = self._page.enter_context(page)
-        elif isinstance(result, Report) and self._problem is not None:
-            self._show(result, self._problem)
+            self.server = self._page.enter_context(page)
+        elif isinstance(result, Report) and self.server and self._problem:
+            self._show(result, self._problem, self.server.viewer)
 
-    def _show(self, report: Report, problem: Problem[jaxik.FootIK]) -> None:
+    def _show(self, report: Report, problem: Problem[jaxik.FootIK], shown: Viewer) -> None:
         """Shows the best point where it differs from the last one."""
         cost, when = self._last
         now = time.monotonic()
@@ -149,19 +127,4 @@ class FitWatch(activity.Watcher):
             self._last = (report.best, now)
             ik = alone(problem.space.unpack(report.best_u))
             note = f"The fit goes on: {report.stage}, best cost {report.best:.6g}."
-            self.viewer.restart(BEST, ik, note)
-
-
-def _page() -> ModuleType:
-    """The modules of the page.
-
-    Raises:
-        ValueError: viser is not installed.
-    """
-    try:
-        import viser  # noqa: F401
-    except ImportError:
-        raise ValueError(EXTRA) from None
-    from . import page
-
-    return page
+            shown.restart(BEST, ik, note)

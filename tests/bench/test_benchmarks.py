@@ -501,7 +501,7 @@ def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_ste
 def test_a_drag_is_measured_without_its_compilation(monkeypatch):
     systems = []
     ik, clip = presets.record(), workloads.walk(12)
-    session = SimpleNamespace(starts={DEFAULT: ik}, rig=clip.rig)
+    session = SimpleNamespace(starts={DEFAULT: ik}, rig=clip.rig, free=())
     solver = SimpleNamespace(solve=systems.append, animation=SimpleNamespace(clip=clip))
     monkeypatch.setattr(benchmarks, "viewed_walk", lambda frame_count: session)
     monkeypatch.setattr(benchmarks, "Solver", lambda session: solver)

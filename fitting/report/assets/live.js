@@ -1,39 +1,20 @@
-// Sliders of parameters: a worker solves the clip again, and its motion is drawn instead.
+// Sliders of parameters: the clip is solved again, and its motion is drawn instead.
 
-// Bytes that live_data.py has compressed.
-async function unpacked(text) {
-  const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Response(stream).arrayBuffer();
-}
-const doubles = async (text) => new Float64Array(await unpacked(text));
-
-// A table of so many columns, row by row, of which live_data.py has packed 6 bytes of each number.
-async function table(text, columns) {
-  const planes = new Uint8Array(await unpacked(text)), count = planes.length / 6, rows = count / columns;
-  const bytes = new Uint8Array(8 * count);
-  for (let i = 0; i < planes.length; i++) {
-    const place = i % count, row = place % rows, column = (place - row) / rows;
-    bytes[8 * (row * columns + column) + 2 + (i - place) / count] = planes[i];
-  }
-  return new Float64Array(bytes.buffer);
-}
-const integers = async (text) => new Uint32Array(await unpacked(text));
+const PAUSE = 1000; // ms, after which moving the same slider is a new step
 
 const shownNumber = (value) => (Number.isFinite(value) ? String(Number(value.toPrecision(4))) : value > 0 ? "∞" : "-∞");
 
-function make(name, properties = {}, ...children) {
-  const element = Object.assign(document.createElement(name), properties);
-  element.append(...children);
-  return element;
-}
-
 class LivePanel {
-  constructor(player, clips) {
+  constructor(player) {
     this.player = player;
-    this.scripts = Object.assign({}, ...clips.map((clip) => clip.live?.scripts));
+    this.scripts = Object.assign({}, ...player.clips.map((clip) => clip?.live?.scripts));
     this.panel = element("live");
     this.panel.addEventListener("toggle", () => this.panel.open && this.open());
     element("live-system").addEventListener("change", (event) => this.player.watch(event.target.value));
+    element("live-undo").addEventListener("click", () => this.step(this.done, this.undone));
+    element("live-redo").addEventListener("click", () => this.step(this.undone, this.done));
+    element("live-save")?.addEventListener("click", () => this.save());
+    document.addEventListener("keydown", (event) => this.key(event));
     this.setClip();
   }
 
@@ -49,8 +30,8 @@ class LivePanel {
 
   close() {
     this.say("");
-    this.worker?.terminate();
-    this.worker = this.system = null;
+    this.solver?.terminate();
+    this.solver = this.system = null;
   }
 
   // Goes on with another system, if it is one that is now watched.
@@ -70,7 +51,7 @@ class LivePanel {
     this.begin((watched ?? systems[0]).key);
   }
 
-  // Makes the sliders of a system and a worker that solves it.
+  // Makes the sliders of a system and what solves it.
   async begin(key) {
     if (this.skeleton?.solution) this.player.show(this.skeleton, null);
     this.close();
@@ -84,11 +65,12 @@ class LivePanel {
       const starts = await Promise.all(names.map((name) => doubles(system.starts[name])));
       if (this.system !== system) return;
       this.starts = new Map(names.map((name, i) => [name, starts[i]]));
-      this.parameters = starts[0].slice();
-      this.makeControls();
-      const worker = await this.makeWorker(system);
-      if (this.system !== system) return worker.terminate();
-      this.worker = worker;
+      this.costs = new Map();
+      this.own = starts[0]; // with which the page was made
+      this.restart(starts[0].slice());
+      const solver = await this.makeSolver(system);
+      if (this.system !== system) return solver.terminate();
+      this.solver = solver;
       this.busy = false;
       this.send();
     } catch (error) {
@@ -96,32 +78,28 @@ class LivePanel {
     }
   }
 
-  async makeWorker(system) {
-    const { live, player } = this, script = this.scripts[system.script];
-    const [code, numbers, measures, observed] = await Promise.all([
-      unpacked(script.code), table(live.numbers, live.columns), doubles(live.measures), unpacked(live.observed),
-    ]);
-    const surfaces = await Promise.all(live.surfaces.map(async (surface) => {
-      if (surface.kind === "Heights") return { ...surface, heights: await table(surface.heights, surface.columns) };
-      if (surface.kind !== "Mesh") return surface;
-      const [vertices, triangles, layers] = await Promise.all([table(surface.vertices, 3), integers(surface.triangles), integers(surface.layers)]);
-      return { ...surface, vertices, triangles, layers };
-    }));
-    const [first] = player.skeletons; // the animation, whose joints move with the solved ones
-    const animated = Float32Array.from({ length: 3 * first.points * player.clip.frames }, (_, i) =>
-      first.at(Math.floor(i / (3 * first.points)), i % (3 * first.points)),
-    );
-    const address = URL.createObjectURL(new Blob([code], { type: "text/javascript" }));
-    const worker = new Worker(address);
-    const ifCurrent = (act) => (event) => worker === this.worker && act(event); // an ended one may still say something
-    worker.onmessage = ifCurrent((event) => this.receive(event.data));
-    worker.onerror = ifCurrent((event) => this.say(`This browser cannot solve the motion: ${event.message}`));
-    const { frames, step, columns, anchors, reach } = live, { pelvis, soles } = first, { layout } = script, { trunk } = system;
-    worker.postMessage({ clip: {
-      frames, step, columns, anchors, reach, pelvis, soles, layout, trunk, numbers, measures, surfaces, animated,
-      observed: new Uint8Array(observed),
-    } });
-    return worker;
+  async makeSolver(system) {
+    const { live, player } = this, { program } = player;
+    const solver = program
+      ? program.solver(player.index)
+      : await workerSolver(live, this.scripts[system.script], system.trunk, player.skeletons[0], player.clip.frames);
+    const ifCurrent = (act) => (event) => solver === this.solver && act(event); // an ended one may still say something
+    solver.onmessage = ifCurrent((event) => this.receive(event.data));
+    solver.onerror = ifCurrent((event) => {
+      this.busy = false;
+      this.say(program ? event.message : `This browser cannot solve the motion: ${event.message}`);
+      if (this.isWanted) this.send();
+    });
+    return solver;
+  }
+
+  // Begins with these values, without a way back to earlier ones.
+  restart(parameters) {
+    this.parameters = parameters;
+    this.done = [];
+    this.undone = [];
+    this.last = { name: null, time: 0 };
+    this.makeControls();
   }
 
   makeControls() {
@@ -138,15 +116,20 @@ class LivePanel {
       make("details", { open: number === 0, className: "group" },
         make("summary", {}, name), ...sliders.map((slider) => this.makeControl(slider))),
     ));
+    this.makeStarts();
+    this.refresh();
+  }
+
+  makeStarts() {
     element("live-starts").replaceChildren(...[...this.starts].map(([name, values]) => {
       const button = make("button", { type: "button" }, name);
       button.addEventListener("click", () => {
+        this.remember(null);
         this.parameters.set(values);
         this.update();
       });
       return button;
     }));
-    this.refresh();
   }
 
   makeControl(slider) {
@@ -156,6 +139,7 @@ class LivePanel {
       : make("input", { id, type: "range", autocomplete: "off", min: slider.low, max: slider.high, step: slider.step });
     const output = make("output", { htmlFor: id });
     input.addEventListener("input", () => {
+      this.remember(slider.name);
       this.parameters[slider.at] = slider.switch ? Number(input.checked) : this.inOrder(slider, Number(input.value));
       this.update();
     });
@@ -176,6 +160,31 @@ class LivePanel {
     return above.length ? Math.max(value, ...this.parameters.subarray(...above)) : value;
   }
 
+  // Keeps the values as they are; moves of one slider without a pause are one step.
+  remember(name) {
+    const now = performance.now();
+    if (name === null || name !== this.last.name || now - this.last.time > PAUSE) this.done.push(this.parameters.slice());
+    this.undone = [];
+    this.last = { name, time: now };
+  }
+
+  step(source, target) {
+    if (!source?.length) return;
+    target.push(this.parameters.slice());
+    this.parameters.set(source.pop());
+    this.last = { name: null, time: 0 };
+    this.update();
+  }
+
+  key(event) {
+    if (!this.system || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=number], input[type=text]")) return;
+    const isRedo = event.key === "y" || (event.key.toLowerCase() === "z" && event.shiftKey);
+    if (!isRedo && event.key !== "z") return;
+    event.preventDefault();
+    if (isRedo) this.step(this.undone, this.done);
+    else this.step(this.done, this.undone);
+  }
+
   get original() {
     return this.starts.values().next().value;
   }
@@ -190,7 +199,7 @@ class LivePanel {
     this.isWanted = true;
     this.requested ??= requestAnimationFrame(() => {
       this.requested = null;
-      if (this.worker && !this.busy) this.send();
+      if (this.solver && !this.busy) this.send();
     });
   }
 
@@ -211,49 +220,73 @@ class LivePanel {
     }
     element("live-changes").textContent = changes.join("\n");
     element("live-changes").hidden = !changes.length;
+    element("live-undo").disabled = !this.done.length;
+    element("live-redo").disabled = !this.undone.length;
   }
 
   send() {
     this.busy = true;
     this.isWanted = false;
     this.sent = this.parameters.slice();
-    this.worker.postMessage({ parameters: this.sent });
+    this.solver.postMessage({ parameters: this.sent, layers: this.player.layers });
   }
 
   receive(solution) {
     this.busy = false;
     this.panel.solution = { ...solution, parameters: this.sent }; // for tests
     const { isChanged } = this;
-    if (isChanged || this.skeleton.solution) this.player.show(this.skeleton, isChanged ? solution : null);
+    const isOwn = this.sent.every((value, i) => value === this.own[i]);
+    if (!isOwn || this.skeleton.solution || this.player.program) {
+      this.player.show(this.skeleton, isOwn ? null : solution, solution);
+    }
     const { label } = this.skeleton, [name] = this.starts.keys();
-    const before = this.distance(null), now = this.distance(solution);
-    const apart = now === null ? "" : isChanged
-      ? ` Ankles ${now} cm from captured (rms); as ${name} ${before} cm.`
-      : ` Ankles ${before} cm from captured (rms).`;
-    const words = isChanged
-      ? `Live: “${label}” solved by this page in ${Math.round(solution.milliseconds)} ms.`
-      : `As ${name}: move a slider.`;
-    this.say(words + apart);
+    const words = isChanged ? `Live: “${label}” solved in ${Math.round(solution.milliseconds)} ms.` : `As ${name}: move a slider.`;
+    this.say([words, this.distanceText(solution, name), this.costText(solution)].filter(Boolean).join(" "));
     if (this.isWanted) this.send();
   }
 
-  // Root mean square over frames and legs, in cm; null where no captured motion is known.
-  distance(solution) {
-    const captured = this.player.skeletons.find((skeleton) => skeleton.key === this.live.captured);
-    if (!captured) return null;
-    const { skeleton } = this, shown = skeleton.solution;
-    skeleton.show(solution);
-    let sum = 0, count = 0;
-    for (let frame = 0; frame < this.player.clip.frames; frame++) {
-      skeleton.legs.forEach((joints, leg) => {
-        for (const axis of [0, 1, 2]) {
-          sum += (skeleton.at(frame, 3 * joints[2] + axis) - captured.at(frame, 3 * captured.legs[leg][2] + axis)) ** 2;
-        }
-        count++;
-      });
-    }
+  distanceText(solution, name) {
+    const { measuring } = this.player, { skeleton } = this;
+    if (!measuring.captured) return "";
+    const shown = skeleton.solution;
+    const [before, now] = [null, solution].map((motion) => {
+      skeleton.show(motion);
+      return measuring.row(skeleton)[0].toFixed(2);
+    });
     skeleton.show(shown);
-    return (100 * Math.sqrt(sum / count)).toFixed(2);
+    return this.isChanged
+      ? `Ankles ${now} cm from captured (rms); as ${name} ${before} cm.`
+      : `Ankles ${before} cm from captured (rms).`;
+  }
+
+  // What a fit minimises, beside that of the systems to go back to.
+  costText({ cost }) {
+    if (cost === undefined || cost === null) return "";
+    for (const [name, values] of this.starts) {
+      if (values.every((value, i) => value === this.sent[i])) this.costs.set(name, cost);
+    }
+    const others = [...this.costs].map(([name, value]) => `${name} ${Number(value.toPrecision(6))}`).join(", ");
+    return `Cost ${Number(cost.toPrecision(6))}${others ? ` (${others})` : ""}.`;
+  }
+
+  async save() {
+    const words = element("live-saved");
+    try {
+      const messages = await this.player.program.save(this.parameters, element("live-drop").checked);
+      words.replaceChildren(...messages.map((message) => make("li", {}, message)));
+    } catch (error) {
+      words.replaceChildren(make("li", {}, error.message));
+    }
+  }
+
+  // Another system to go back to, with which the sliders begin: as a fit that goes on finds better ones.
+  async replace(name, packed, note) {
+    if (!this.system) return;
+    const values = await doubles(packed);
+    this.starts = new Map([[name, values], ...[...this.starts].filter(([other]) => other !== name)]);
+    this.restart(values.slice());
+    element("live-saved").replaceChildren(make("li", {}, note));
+    this.update();
   }
 
   say(text) {
@@ -261,5 +294,3 @@ class LivePanel {
     element("live-status").textContent = text;
   }
 }
-
-if (element("live") && player.stage) player.live = new LivePanel(player, player.clips);

@@ -17,11 +17,25 @@ function makeStage(canvas) {
   return null;
 }
 
+function make(name, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+function swatch({ colour }) {
+  const mark = make("span", { className: "swatch" });
+  mark.style.background = colour;
+  return mark;
+}
+
 class Player {
-  constructor(clips) {
+  // `program` serves the page, and has those of its `clips` that are null; or it is null.
+  constructor(clips, program) {
     this.clips = clips;
+    this.program = program;
     this.canvas = element("view");
-    const visible = clips.flatMap((clip) => clip.skeletons).filter((skeleton) => skeleton.visible);
+    const visible = clips.flatMap((clip) => clip?.skeletons ?? []).filter((skeleton) => skeleton.visible);
     this.shown = new Set(visible.map((skeleton) => skeleton.key));
     this.playing = false;
     this.time = 0; // frames
@@ -30,15 +44,36 @@ class Player {
     this.canvas.addEventListener("webglcontextlost", showFailure);
     this.camera = new Camera(this.canvas, () => this.request());
     this.timeline = new Timeline(element("timeline"));
-    this.readPalette();
+    this.curves = new Curves(element("curves"));
+    this.figures = new FigureTable(this);
+    this.overlays = new Layers(this);
+    this.contacts = program && new ContactEditor(this);
     this.connect();
     this.setClip(0);
+  }
+
+  // Shows another clip, once it is here.
+  async choose(index) {
+    this.wanted = index;
+    this.clips[index] ??= await this.program.clip(index);
+    if (this.wanted === index) this.setClip(index);
+  }
+
+  replaceClip(index, clip) {
+    this.clips[index] = clip;
+    const { time } = this;
+    this.setClip(index);
+    this.seek(Math.min(time, clip.frames - 1));
   }
 
   setClip(index) {
     this.index = index;
     this.clip = this.clips[index];
+    this.readPalette();
+    this.overlays.take(null);
     this.skeletons = this.clip.skeletons.map((packed) => new Skeleton(packed, this.clip.legs.length, this.clip.visibleDepth));
+    this.measuring = new Measuring(this.clip, this.skeletons);
+    this.editor = this.contacts?.setClip() ?? null;
     this.stage.setGround(new Ground(this.clip.ground, this.clip.size));
     element("time").max = this.clip.frames - 1;
     this.makeLegend();
@@ -52,7 +87,7 @@ class Player {
 
   // What the marks over the slider, the red feet's label, the shadow and the camera belong to.
   watch(key) {
-    const candidates = this.skeletons.filter((skeleton) => skeleton.worst);
+    const candidates = this.skeletons.filter((skeleton) => skeleton.key !== "captured");
     this.watched = candidates.find((skeleton) => skeleton.key === key) ?? candidates[0];
     const choice = element("watched");
     choice.replaceChildren(...candidates.map(({ key, label }) => new Option(label, key)));
@@ -60,27 +95,26 @@ class Player {
     choice.parentElement.hidden = candidates.length < 2;
     this.shown.add(this.watched.key);
     for (const box of element("legend").querySelectorAll("input")) box.checked = this.shown.has(box.dataset.key);
-    this.timeline.setClip(this.clip, this.watched);
+    this.timeline.setClip(this.clip, this.watched, this.editor);
     this.timeline.point(this.time);
+    this.curves.show(this);
+    this.figures.show();
+    element("jump").hidden = !this.watched.worst;
     this.live?.watch(this.watched.key);
     this.request();
   }
 
   makeLegend() {
     element("legend").replaceChildren();
-    for (const { key, label, colour, solution } of this.skeletons) {
-      const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: this.shown.has(key) });
+    for (const skeleton of this.skeletons) {
+      const { key, label, solution } = skeleton;
+      const box = make("input", { type: "checkbox", checked: this.shown.has(key) });
       box.dataset.key = key;
       box.addEventListener("change", () => {
         this.shown[box.checked ? "add" : "delete"](key);
         this.request();
       });
-      const swatch = document.createElement("span");
-      swatch.className = "swatch";
-      swatch.style.background = colour;
-      const entry = document.createElement("label");
-      entry.append(box, swatch, solution ? `${label}, live` : label);
-      element("legend").append(entry);
+      element("legend").append(make("label", {}, box, swatch(skeleton), solution ? `${label}, live` : label));
     }
   }
 
@@ -93,7 +127,7 @@ class Player {
     element("follow").addEventListener("change", () => this.request());
     element("watched").addEventListener("change", (event) => this.watch(event.target.value));
     element("jump").addEventListener("click", () => this.showWorst());
-    element("clip")?.addEventListener("change", (event) => this.setClip(Number(event.target.value)));
+    element("clip")?.addEventListener("change", (event) => this.choose(Number(event.target.value)));
     for (const button of document.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => this.camera.show(button.dataset.view));
     }
@@ -116,6 +150,7 @@ class Player {
     new ResizeObserver(() => {
       this.timeline.drawAll();
       this.timeline.point(this.time);
+      this.curves.draw();
       this.request();
     }).observe(this.canvas);
   }
@@ -124,6 +159,13 @@ class Player {
     this.play(false);
     this.seek(this.watched.worst.start);
     this.play(true, this.watched.worst.end);
+  }
+
+  // Goes to a frame and stays there.
+  jump(frame) {
+    this.play(false);
+    this.seek(frame);
+    element("time").focus({ preventScroll: true });
   }
 
   // Plays to the last frame, or to another one.
@@ -147,17 +189,25 @@ class Player {
     element("clock").textContent = `${seconds.toFixed(2)} / ${all.toFixed(2)} s`;
     for (const skeleton of this.skeletons) skeleton.pose(time);
     this.timeline.point(time);
+    this.curves.point(time);
     this.request();
   }
 
-  // Draws another motion of a skeleton, or its own again.
-  show(skeleton, solution) {
+  get layers() {
+    return this.overlays.names;
+  }
+
+  // Draws another motion of a skeleton, or its own again; `layers` are those of a solution.
+  show(skeleton, solution, layers = null) {
+    this.overlays.take(layers);
     const isNew = !skeleton.solution !== !solution;
     skeleton.show(solution);
     if (isNew) this.makeLegend();
     skeleton.pose(this.time);
     this.timeline.drawAll();
     this.timeline.point(this.time);
+    this.curves.show(this);
+    this.figures.show();
     this.request();
   }
 
@@ -185,7 +235,7 @@ class Player {
     if (element("follow").checked) this.camera.follow(this.pelvis());
     const shown = this.skeletons.filter((skeleton) => this.shown.has(skeleton.key));
     shown.sort((a, b) => (a === this.watched) - (b === this.watched)); // it throws the shadow
-    this.stage.draw(shown, this.time, this.camera, this.palette);
+    this.stage.draw(shown, this.time, this.camera, this.palette, this.overlays.capsules(this.time));
     this.describe(shown);
   }
 
@@ -225,16 +275,8 @@ class Player {
       low: colour("--ground-low"), high: colour("--ground-high"), grid: colour("--grid"),
       sky: colour("--sky"), sunk: colour("--sunk"),
     };
-    for (const { key, colour: hex } of this.clips.flatMap((clip) => clip.skeletons)) {
+    for (const { key, colour: hex } of this.clips.flatMap((clip) => clip?.skeletons ?? [])) {
       this.palette[key] = light(parts(hex));
     }
   }
 }
-
-const player = new Player(JSON.parse(element("data").textContent).clips);
-onTheme(() => {
-  if (!player.palette) return;
-  player.readPalette();
-  player.frame(performance.now());
-  player.drawStill();
-});

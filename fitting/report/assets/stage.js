@@ -3,6 +3,10 @@
 const HIDDEN = 0.22; // strength of what is behind or in the ground
 const FIELDS_OF_BONE = 11; // start, end, colour with opacity, radius
 
+function addCapsule(fields, start, end, colour, opacity, radius) {
+  fields.push(...start, ...end, ...colour, opacity, radius);
+}
+
 class Stage {
   constructor(canvas) {
     this.canvas = canvas;
@@ -110,7 +114,7 @@ class Stage {
   }
 
   // Draws posed skeletons, the one that throws the shadow last; `palette` has colours of 0 to 1 by name.
-  draw(skeletons, time, camera, palette) {
+  draw(skeletons, time, camera, palette, segments = []) {
     const gl = this.gl;
     const view = camera.matrix(this.resize());
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
@@ -119,6 +123,7 @@ class Stage {
     this.drawGround(skeletons, view, camera, palette);
     const opaqueFirst = [...skeletons].sort((a, b) => b.opacity - a.opacity);
     for (const skeleton of opaqueFirst) this.drawSkeleton(skeleton, time, view, camera, palette);
+    this.drawCapsules(new Float32Array(segments), view, camera);
   }
 
   drawGround(skeletons, view, camera, palette) {
@@ -157,8 +162,11 @@ class Stage {
   }
 
   drawSkeleton(skeleton, time, view, camera, palette) {
+    this.drawCapsules(this.instances(skeleton, skeleton.sunkLegs(time), palette), view, camera);
+  }
+
+  drawCapsules(instances, view, camera) {
     const gl = this.gl, { program, uniform } = this.boneProgram;
-    const instances = this.instances(skeleton, skeleton.sunkLegs(time), palette);
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniform("view"), false, view);
     gl.uniform3fv(uniform("light"), LIGHT);

@@ -50,6 +50,8 @@ class ClipMotions:
     captured: PlacedMotion
     stance: Bool[np.ndarray, "frames legs"]
     """Where the captured foot stands, by the clip's labels or else by its motion."""
+    flat: Clip
+    """The animation, as its file has it."""
     ground: GroundPatch
     errors: dict[str, Errors]
     """Of `before` and `fitted`, against the captured motion."""
@@ -74,6 +76,7 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     return ClipMotions(
         **placed,
         stance=data.reference.stance_labels(),
+        flat=data.base,
         ground=ground_path.around_path(data.reference, data.terrain),
         errors={
             name: accuracy.clip_errors(clip, data.reference, animated)
@@ -103,7 +106,6 @@ def live_clip(fitted: Fit, number: int, motions: ClipMotions) -> LiveClip:
         systems={
             "fitted": LiveSystem({name: own_system(ik, scene) for name, ik in starts.items()}, own)
         },
-        captured="captured",
         has_tracks=bool(scene.tracks),
     )
 

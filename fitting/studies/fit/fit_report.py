@@ -171,12 +171,13 @@ def viewed_clip(
     worst = window.start, window.end
     return ViewedClip(
         {
-            "animated": ViewedMotion("flat animation", clip.animated, motion_data.ANIMATED),
+            "animated": ViewedMotion("flat animation", clip.animated, motion_data.ANIMATED, True),
             "before": ViewedMotion("before the fit", clip.before, motion_data.BEFORE),
             "captured": ViewedMotion(label, clip.captured, motion_data.CAPTURED, visible=True),
             "fitted": ViewedMotion("fitted", clip.fitted, motion_data.FITTED, True, worst),
         },
         clip.stance,
+        clip.flat,
         clip.ground,
         watched="fitted",
         live=live,
