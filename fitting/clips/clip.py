@@ -23,7 +23,8 @@ from .joint_maps import ADVICE, find_roles
 from .rigs import left_directions, rotation
 from .skating import Skating
 
-TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields with frames
+# Optional fields with frames.
+TRACKS = ("stance", "mask", "slide", "grounded", "weight", "probability", "left_out")
 
 INCH = 0.0254  # m
 Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -79,6 +80,12 @@ class Clip:
     """0..1, 0 in the air, on a seat or on a ladder."""
     weight: Float64[np.ndarray, "frames legs"] | None = None
     """0..1, how much foot IK each leg gets."""
+    probability: Float64[np.ndarray, "frames legs"] | None = None
+    """0..1, of stances by a contacts file: the program's, 0 for one by hand; 0 in swings."""
+    left_out: Bool[np.ndarray, "frames legs"] | None = None
+    """True in stances around which the fit leaves the leg out."""
+    start: float = 0.0
+    """s, of the first frame in the clip's file."""
     remarks: tuple[str, ...] = ()
     """Guesses and oddities, for the user."""
     rest_rotations_ls: Float64[np.ndarray, "joints 4"] | None = None
@@ -159,6 +166,13 @@ class Clip:
         if self.stance is not None:
             return self.stance
         return self.skating.stance
+
+    def stance_probability(self) -> Float64[np.ndarray, "frames legs"]:
+        """The probability of each stance that is detected from the motion; 0 in swings."""
+        balls_ws, size = self.joints_ws(3), body.ratio(self.rig)
+        if self.skating.is_clear:
+            balls_ws = balls_ws + self.skating.travel_ws[:, None]
+        return contacts.stance_probability(balls_ws, self.skating.stance, self.fps, size)
 
     @cached_property
     def skating(self) -> Skating:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import ndtr
 
 from jaxik.world.frame import UP
 
@@ -29,6 +30,10 @@ MIN_STANCE = 0.06  # s: shorter slow spells are not stances; runners stand for 0
 HANG_WINDOW = 0.2  # s before and after a slow spell, in which a hanging foot shows
 HANG_HEIGHT = 0.03  # m by which a hanging foot is higher than before and after
 SHORTEST_WAY = 0.05  # m between footholds, below which nothing is beside it
+
+# Deviations of the logarithm of the right limits from the above, and of the height, m.
+SPEED_DOUBT, DURATION_DOUBT, HANG_DOUBT = 0.5, 0.5, 0.015
+LEAST_PROBABILITY = 0.01
 
 ORDER = 4  # of the differences
 GAIN = 70.0**0.5  # of the noise in them: root of the sum of the squares of 1, 4, 6, 4, 1
@@ -58,13 +63,49 @@ def detect_stances(
     for leg in range(slow.shape[1]):
         for first, last in merge_runs(runs(slow[:, leg]), round(MAX_GAP * fps)):
             long_enough = last - first + 1 >= MIN_STANCE * fps
-            window = round(HANG_WINDOW * fps)
-            if long_enough and not _hangs(smooth_ws[:, leg, 1] / size, first, last, window):
+            hang = _hang(smooth_ws[:, leg, 1] / size, first, last, round(HANG_WINDOW * fps))
+            if long_enough and not hang > HANG_HEIGHT:
                 if smooth_ws is not ball_ws:
                     reach = REACH * amplitude(ball_ws)
                     first, last = _whole(ball_ws[:, leg], first, last, reach)
                 stance[first : last + 1, leg] = True
     return stance
+
+
+def stance_probability(
+    ball_ws: Float64[np.ndarray, "frames legs 3"],
+    stance: Bool[np.ndarray, "frames legs"],
+    fps: float,
+    size: float = 1.0,
+) -> Float64[np.ndarray, "frames legs"]:
+    """How probable each detected stance is, in each of its frames; 0 in swings.
+
+    It is the probability that the right limits of speed, duration and hanging height, which are
+    known to within a factor or so, let it pass, as if they were independent. Ends are not judged.
+
+    Args:
+        ball_ws: position of the ball of each foot, m, y up.
+        stance: as `detect_stances` finds them.
+        fps: frames per second.
+        size: length of the legs relative to an adult's.
+    """
+    smooth_ws = steadied(ball_ws, fps, size)
+    speed, window = speeds(smooth_ws, fps), round(HANG_WINDOW * fps)
+    probability = np.zeros(stance.shape)
+    for leg in range(stance.shape[1]):
+        for first, last in runs(stance[:, leg]):
+            frames = slice(first, last + 1)
+            slowness = speed_limit(size) / max(float(np.median(speed[frames, leg])), 1e-9)
+            duration = (last - first + 1) / (fps * MIN_STANCE)
+            hang = _hang(smooth_ws[:, leg, 1] / size, first, last, window)
+            deviations = (
+                np.log(slowness) / SPEED_DOUBT,
+                np.log(duration) / DURATION_DOUBT,
+                (HANG_HEIGHT - hang) / HANG_DOUBT,
+            )
+            whole = float(np.prod(ndtr(deviations)))
+            probability[frames, leg] = max(round(whole, 2), LEAST_PROBABILITY)
+    return probability
 
 
 def speed_limit(size: float) -> float:
@@ -247,13 +288,16 @@ def _whole(
     return first, last + int(after[0]) if len(after) else len(ball_ws) - 1
 
 
-def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:
-    """Whether the foot rises into this run of frames and falls out of it, with adult heights."""
+def _hang(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> float:
+    """How far a foot has risen into this run of frames and falls out of it, with adult heights, m.
+
+    0 where the clip does not show what is before or after.
+    """
     before, after = height[max(first - window, 0) : first], height[last + 1 : last + 1 + window]
     if not len(before) or not len(after):
-        return False
+        return 0.0
     lowest = max(before.min(), after.min())
-    return bool(np.median(height[first : last + 1]) - lowest > HANG_HEIGHT)
+    return float(np.median(height[first : last + 1]) - lowest)
 
 
 def amplitude(points_ws: Float64[np.ndarray, "frames *b 3"]) -> float:

@@ -118,7 +118,9 @@ def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
         raise ValueError(
             f"trim from {start} s to {last} s; wanted 0 <= start <= end <= {clip.seconds:.4f} s"
         )
-    return clip.select(slice(round(start * clip.fps), round(last * clip.fps) + 1))
+    first = round(start * clip.fps)
+    part = clip.select(slice(first, round(last * clip.fps) + 1))
+    return replace(part, start=clip.start + first / clip.fps)
 
 
 def observed_span(clip: Clip) -> tuple[int, int]:

@@ -20,6 +20,7 @@ from .formats.markers import draft_marker_map, is_marked, joint_name, read_marke
 from .formats.npz import read_npz
 from .joint_maps import read_joint_map, template
 from .skating import TRAVELS, Travel
+from .stances import contacts_path, load_stances
 
 JointMap = Mapping[str, str] | str | Path
 """Role to joint name, see `joint_maps.find_roles`; or a file that `clips.joint_maps` reads."""
@@ -102,6 +103,7 @@ def load_clip(
     animation: str | None = None,
     travel: str | None = None,
     sole: float | None = None,
+    contacts: str | Path | bool = True,
 ) -> Clip:
     """Reads a motion file as a clip in metres with y up.
 
@@ -125,6 +127,8 @@ def load_clip(
             it, and "auto", or None, moves it in a cycle that is clearly in place.
         sole: m, of the balls of flat feet over their soles; None measures it over a floor at height
             0, or estimates it from the feet's length.
+        contacts: a contacts file, see `clips.stances`; True takes the one beside the clip, if there
+            is one, and False none.
 
     Returns:
         The clip; its `remarks` list every guess. A file without recognised legs loads, and its
@@ -133,7 +137,8 @@ def load_clip(
     Raises:
         ValueError: no such file, an unknown format, a file that is not what its suffix promises
             (with the line, for text formats), an argument out of range or of another format, or
-            names in `joints` that the file lacks.
+            names in `joints` that the file lacks; or a contacts file that is damaged or belongs
+            to another clip.
     """
     path = Path(path)
     _check_arguments(path, asf, animation)
@@ -151,14 +156,29 @@ def load_clip(
         arguments = {**stated, "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
-        return edit.on_floor(read_npz(path), 0.0, sole)
+        return edit.on_floor(with_contacts(read_npz(path), path, contacts), 0.0, sole)
     if is_marked(path):
         recording = read_marked(path, joints, scale)
         if joints is not None:  # which named markers
             stated["joints"] = {role: joint_name(role) for role in joints}
     else:
         recording = _read(path, asf, animation, fps)
-    return edit.on_floor(clip_from_recording(recording, path.name, **stated), 0.0, sole)
+    clip = clip_from_recording(recording, path.name, **stated)
+    return edit.on_floor(with_contacts(clip, path, contacts), 0.0, sole)
+
+
+def with_contacts(clip: Clip, path: Path, contacts: str | Path | bool = True) -> Clip:
+    """The clip of a file with the stances of its contacts file.
+
+    Args:
+        clip: as its own file has it.
+        path: that file.
+        contacts: as for `load_clip`, which also says what is raised.
+    """
+    if isinstance(contacts, bool):
+        beside = contacts_path(path)
+        return load_stances(beside, clip) if contacts and beside.exists() else clip
+    return load_stances(Path(contacts), clip)
 
 
 def _is_saved_clip(path: Path) -> bool:

@@ -20,7 +20,7 @@ def describe(clip: Clip) -> Summary:
     Among the `legs`, `side` is 1 left, -1 right and 0 neither, `knee_axis` a unit vector in knee
     space, `ankle_from_foot` a unit quaternion, wxyz, `contacts` the number of stances of which a
     frame was observed, `contact_share` their fraction of the observed frames, and `contacts_from`
-    either "file" or "motion".
+    "contacts file", "file" or "motion".
     """
     warnings = list(clip.remarks)
     (first, last), (start, end) = edit.motion_span(clip), edit.observed_span(clip)
@@ -60,6 +60,9 @@ def _joint_map(clip: Clip) -> dict[str, str]:
 
 def _describe_legs(clip: Clip) -> Summary:
     rig, stance = clip.rig, clip.observed_stances()
+    source = "motion" if clip.stance is None else "file"
+    if clip.probability is not None:
+        source = "contacts file"
     share = stance[clip.observed].sum(axis=0) / max(clip.observed.sum(), 1)
     return {
         name: {
@@ -73,7 +76,7 @@ def _describe_legs(clip: Clip) -> Summary:
             "ankle_from_foot": np.asarray(rig.ankle_from_foot[leg]).tolist(),
             "contacts": len(contacts.runs(stance[:, leg])),
             "contact_share": float(share[leg]),
-            "contacts_from": "file" if clip.stance is not None else "motion",
+            "contacts_from": source,
         }
         for leg, name in enumerate(rig.names)
     }

@@ -25,7 +25,7 @@ import jaxik
 from fitting.clips import contacts, edit, load_clip
 from fitting.clips.clip import Clip, local_from_world, world_from_local
 from fitting.clips.formats.npz import holds_base, read_base
-from fitting.clips.load import AS_FOUND, ClipOptions
+from fitting.clips.load import AS_FOUND, ClipOptions, with_contacts
 from fitting.clips.rigs import Vectors, bone_rotation, knee_hinges, knee_positions, unit
 from fitting.ground.coverage import FLAT, relief
 from fitting.ground.ground_path import SKY, heights_under
@@ -122,7 +122,7 @@ def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = A
     """
     if holds_base(path):
         options.check_use([path], str(path))
-        clip = read_base(path)
+        clip = with_contacts(read_base(path), path)
     else:
         clip = load_clip(path, **options.given)
     with error_context(path):

@@ -144,12 +144,15 @@ def _words(shape: tuple[int | str, ...]) -> str:
 
 FPS = Wanted("number", low=SLOWEST, high=FASTEST)
 FRAMES = Wanted("number", ("frames",), low=0.0, high=1.0, optional=True)
+OF_LEGS = Wanted("number", ("frames", "legs"), low=0.0, high=1.0, optional=True)
 TRACK_ARRAYS = {
     "stance": Wanted("switch", ("frames", "legs"), optional=True),
     "mask": Wanted("switch", ("frames",), optional=True),
     "slide": FRAMES,
     "grounded": FRAMES,
-    "weight": Wanted("number", ("frames", "legs"), low=0.0, high=1.0, optional=True),
+    "weight": OF_LEGS,
+    "probability": OF_LEGS,
+    "left_out": Wanted("switch", ("frames", "legs"), optional=True),
 }
 RIG_ARRAYS = {
     "knee_axis_ls": Wanted("number", ("legs", 3), unit=True),
@@ -285,6 +288,7 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         remarks=tuple(map(str, content["remarks"])),
         rest_rotations_ls=rest.astype(np.float64) if rest is not None else None,
         channels=tuple(map(str, content["channels"])) if "channels" in content else None,
+        start=0.0,  # whatever it was cut from
     )
 
 
