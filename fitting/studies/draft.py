@@ -42,7 +42,7 @@ from jaxik.world.body import scaled_declarations
 
 from . import terrain_report
 from .fit import capture_check, fit_tables
-from .fit.capture_check import CaptureCheck, stances_of
+from .fit.capture_check import CaptureCheck, measure_stances
 from .output import output_folder
 from .terrain_report import SCATTER
 
@@ -149,7 +149,7 @@ def knee_bend(clip: Clip) -> Float[np.ndarray, "frames legs"]:
 
 
 def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumption]:
-    stances = stances_of(data)
+    stances = measure_stances(data)
     covered = ~np.isnan(stances.ground)
     if ground is not None:
         error = 100 * ground.predictions[ground.chosen].rms

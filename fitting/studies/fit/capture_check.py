@@ -12,12 +12,14 @@ from jaxtyping import Bool, Float, Float64, Int
 
 from fitting.clips import contacts
 from fitting.clips.contacts import runs
+from fitting.clips.stances import Stance, stances_of
 from fitting.experiment.problems import ClipData
 from fitting.ground import meshes
 from fitting.ground.coverage import FLAT, relief
 from fitting.motion import measures
 from fitting.motion.measures import with_soles_of
 from fitting.motion.playback import Playback
+from fitting.runtime.precision import in_float64
 from jaxik.world import body
 
 STEP = 0.10  # m: what a capture should climb
@@ -36,8 +38,10 @@ FEW_STANCES = 6  # of all feet
 
 VISIBLE = 0.015  # m, from which an offset is named
 CLEAR = 2.0  # times its scatter
+OUTLIER = 3.0  # times the scatter of stances: one of 50 is 2 times off by chance
 FEWEST_STANCES = 4  # stances for a height
 FEWEST_FOR_TILT = 8
+MOST_NAMED = 5  # footholds that a sentence names
 EXPLAINED = 0.8  # of the variance of heights between stances, by a tilt
 
 LONGEST = 0.2  # s, that is looked for
@@ -73,7 +77,7 @@ class CaptureCheck:
 
 def check(clips: Sequence[ClipData]) -> CaptureCheck:
     """What clips can tell, and how good their data are."""
-    each = [stances_of(clip) for clip in clips]
+    each = [measure_stances(clip) for clip in clips]
     reliefs = [
         relief(*_known(stances)) / body.ratio(clip.reference.rig)
         for clip, stances in zip(clips, each, strict=True)
@@ -86,10 +90,12 @@ def check(clips: Sequence[ClipData]) -> CaptureCheck:
     return CaptureCheck(tuple(lines), flat)
 
 
-def stances_of(data: ClipData) -> Stances:
-    """The stances of a clip over its ground; none where no foot stands."""
+def measure_stances(data: ClipData) -> Stances:
+    """The stances of a clip over its ground that are fitted; none where no foot stands."""
     clip, height_under = data.reference, meshes.height_function(data.terrain)
     standing, balls = clip.observed_stances(), clip.joints_ws(3)
+    if clip.left_out is not None:
+        standing &= ~clip.left_out
     places = [
         (first, last, leg)
         for leg in range(standing.shape[1])
@@ -131,6 +137,81 @@ def _quality(data: ClipData, stances: Stances) -> Iterator[str]:
         yield (
             f"the floor drifts: from the first stance to the last the soles' height above the "
             f"ground {way} by {100 * abs(drift):.1f} cm; is the terrain that of this capture?"
+        )
+    yield from _disagreements(data)
+
+
+class Foothold(NamedTuple):
+    """A stance of a clip over its ground."""
+
+    leg: str
+    stance: Stance
+    gap: float
+    """m, of the lower point of the sole over the ground, median; NaN where there is none."""
+    disagrees: bool
+    """Whether the gap is clearly another one than that of most stances, or unknown."""
+
+    @property
+    def text(self) -> str:
+        """Which one it is, and what is wrong with it."""
+        if np.isnan(self.gap):
+            where = "has no ground below it"
+        else:
+            where = f"is {100 * abs(self.gap):.1f} cm {'over' if self.gap > 0 else 'in'} it"
+        return f"{self.leg} from {self.stance.text} {where}"
+
+
+@in_float64
+def footholds(data: ClipData) -> tuple[Foothold, ...]:
+    """The stances of a captured clip over its ground, leg by leg, as `stances_of` lists them.
+
+    An offset that all have in common is no disagreement: see `measure_ground`. Stances that the fit
+    leaves out are judged by the others.
+    """
+    captured = with_soles_of(data.reference, data.base)
+    gap = measures.soles(captured, data.base, data.terrain).gap
+    listed = [(leg, stance) for leg, of in stances_of(captured).items() for stance in of]
+    labels = captured.stance_labels()
+    gaps = np.array(
+        [
+            _median(gap[first : last + 1, leg])
+            for leg in range(labels.shape[1])
+            for first, last in runs(labels[:, leg])
+        ]
+    )
+    fitted = np.array([not stance.left_out for _, stance in listed], bool)
+    judges = gaps[np.isfinite(gaps) & fitted]
+    typical, scatter = _middle(judges) if len(judges) >= FEWEST_STANCES else (0.0, 0.0)
+    differs = ~(np.abs(gaps - typical) <= max(VISIBLE, OUTLIER * scatter))  # true for NaN
+    return tuple(
+        Foothold(*each, float(gap), bool(disagrees))
+        for each, gap, disagrees in zip(listed, gaps, differs, strict=True)
+    )
+
+
+def _median(gap: Float64[np.ndarray, " frames"]) -> float:
+    """Of what is known; NaN where nothing is."""
+    known = gap[np.isfinite(gap)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _middle(heights: Float64[np.ndarray, " stances"]) -> tuple[float, float]:
+    """Median, and standard deviation from it as the median deviation shows it."""
+    height = float(np.median(heights))
+    return height, 1.4826 * float(np.median(np.abs(heights - height)))
+
+
+def _disagreements(data: ClipData) -> Iterator[str]:
+    """A sentence on the footholds that do not agree with the ground, if there are any."""
+    all_of_clip = footholds(data)
+    wrong = [each for each in all_of_clip if each.disagrees and not each.stance.left_out]
+    if wrong:
+        named = [each.text for each in sorted(wrong, key=lambda each: -abs(each.gap))[:MOST_NAMED]]
+        rest = f", and {len(wrong) - len(named)} more" if len(wrong) > len(named) else ""
+        yield (
+            f"{len(wrong)} of {len(all_of_clip)} footholds do not agree with the ground: "
+            f"{', '.join(named)}{rest}; put them right or leave them out in the contacts file of "
+            "the clip (`jaxik inspect --contacts` shows it), or put the terrain right"
         )
 
 
@@ -183,8 +264,7 @@ def measure_ground(
         return GroundOffset(0.0, float("nan"), len(heights))
     tilts = _tilts(heights, where)
     level = heights - (where - where.mean(axis=0)) @ np.tan(tilts)
-    height = float(np.median(level))
-    scatter = 1.4826 * float(np.median(np.abs(level - height)))
+    height, scatter = _middle(level)
     is_clear = abs(height) > max(VISIBLE, CLEAR * scatter)
     return GroundOffset(height if is_clear else 0.0, scatter, len(heights), *map(float, tilts))
 
