@@ -39,6 +39,7 @@ TEMPLATE = Path()
 @command(
     argument("clip", type=Path, metavar="CLIP", help=CLIPS),
     flag("--json", "as JSON"),
+    flag("--contacts", "print when each foot stands, as a contacts file to be edited"),
     group(
         CLIP_GROUP,
         argument(
@@ -55,21 +56,28 @@ def inspect(options: argparse.Namespace) -> int:
     jaxik inspect walk.amc --asf skeleton.asf --json
     jaxik inspect walk.bvh --joints > map.toml     a joint map to be edited, and then used:
     jaxik inspect walk.bvh --joints map.toml
+    jaxik inspect walk.bvh --contacts > walk.contacts.toml    beside the clip, it is always read
     """
-    from fitting.clips import load_clip, summary
+    from fitting.clips import load_clip, stances, summary
     from fitting.clips.load import draft_joint_map
     from fitting.report.formatting import TableText
 
     reading = clip_options(options)
     if options.joints == TEMPLATE:
-        if options.json:
-            raise ValueError("--json is for what was understood, and not for a joint map")
+        if options.json or options.contacts:
+            raise ValueError("a joint map is not printed with --json or --contacts; leave that out")
         with activity.announced(f"Reading {options.clip.name}"):
             drafted = draft_joint_map(options.clip, reading)
         print(drafted)
         return 0
     with activity.announced(f"Reading {options.clip.name}"):
-        clip = load_clip(options.clip, **reading.given)
+        # Redirected to where it is read, the contacts file is already empty.
+        clip = load_clip(options.clip, contacts=not options.contacts, **reading.given)
+    if options.contacts:
+        if options.json:
+            raise ValueError("--json is for what was understood, and not for contacts")
+        print(stances.to_toml(clip), end="")
+        return 0
     described = summary.describe(clip)
     if options.json:
         print(summary.as_json(described))
