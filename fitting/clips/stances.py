@@ -236,23 +236,20 @@ def to_toml(clip: Clip) -> str:
     return f"{HEAD.format(source=source)}\n{tomli_w.dumps(table)}"
 
 
-def left_out_frames(
-    stance: Bool[np.ndarray, "frames legs"], left_out: Bool[np.ndarray, "frames legs"]
-) -> Bool[np.ndarray, "frames legs"]:
-    """Where a leg does not count: around its left out stances, half of each swing beside them.
+def left_out_frames(clip: Clip) -> Bool[np.ndarray, "frames legs"] | None:
+    """Where the fit leaves a leg out: around stances, with half of each swing beside them.
 
-    A foot in a swing leaves one foothold and seeks another, so the half of it that is nearer to a
-    wrong foothold is as wrong.
-
-    Args:
-        stance: where each foot stands.
-        left_out: in which stances it does not count.
+    A foot in a swing leaves one foothold and seeks another, so that the half which is nearer to a
+    wrong foothold is as wrong. None where nothing is left out.
     """
+    if clip.left_out is None or not clip.left_out.any():
+        return None
+    stance = clip.stance_labels()
     around = np.zeros_like(stance)
     for leg in range(stance.shape[1]):
         runs = contacts.runs(stance[:, leg])
         middles = [(last + first + 1) // 2 for (_, last), (first, _) in itertools.pairwise(runs)]
         parts = itertools.pairwise([0, *middles, len(stance)])
         for (first, last), (begin, end) in zip(runs, parts, strict=False):  # no stance, one part
-            around[begin:end, leg] = left_out[first : last + 1, leg].any()
+            around[begin:end, leg] = clip.left_out[first : last + 1, leg].any()
     return around

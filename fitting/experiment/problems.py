@@ -17,6 +17,7 @@ from jaxtyping import Bool
 import jaxik
 from fitting.clips import Clip, edit, flight, load_clip
 from fitting.clips.clip_frames import frames_from_clip, raised
+from fitting.clips.stances import left_out_frames
 from fitting.ground import coverage, meshes
 from fitting.ground.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.ground.meshes import TerrainOptions
@@ -264,6 +265,7 @@ def make_scene(
     labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
     observed = reference.observed
     held_out = np.zeros_like(observed) if held_out is None else held_out
+    left_out = left_out_frames(reference)
     all_sigmas = DEFAULT_SIGMAS | dict(sigmas)
     if stance is None:
         all_sigmas["contact"] = float("inf")
@@ -280,6 +282,7 @@ def make_scene(
             observed=jax.device_put(observed & ~held_out),
             held_out=jax.device_put(observed & held_out),
             label=label,
+            left_out=None if left_out is None else jax.device_put(left_out),
         ),
         sigmas=_sigmas(all_sigmas),
         tracks={name: jax.device_put(values) for name, values in tracks.items()},

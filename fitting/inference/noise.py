@@ -413,12 +413,11 @@ def _errors_of_clips(problem: Problem[jaxik.FootIK], u: Vector) -> list[dict[str
 
 def _counted(scene: Scene, by_kind: Mapping[str, Array]) -> dict[str, Errors]:
     """Errors of each measured kind in one clip, and which of them count."""
-    seen, present = np.asarray(scene.reference.observed), np.asarray(scene.rig.present, bool)
     errors = {}
     for kind, values in by_kind.items():
         array = np.asarray(values, np.float64)
-        legs = present if array.ndim == 3 else np.ones(1, bool)
-        counts = np.repeat(seen[:, None] & legs, array[0].size // len(legs), axis=1)
+        active = np.asarray(scene.counts(kind))
+        counts = np.repeat(active, array[0].size // active.shape[1], axis=1)
         errors[kind] = Errors(np.where(counts, array.reshape(counts.shape), 0.0), counts)
     return errors
 
@@ -481,13 +480,11 @@ def with_unknown_sigmas(problem: Problem[jaxik.FootIK]) -> Problem[jaxik.FootIK]
 
 def _of_kind(scene: Scene, kind: str, kinds: list[str]) -> Float[np.ndarray, " residuals"]:
     """1 at the active residuals of a kind, 0 at others; ordered as by `residuals_of_scene`."""
-    seen, present = np.asarray(scene.reference.observed), np.asarray(scene.rig.present)
-    each = {name: np.zeros(seen.size * size) for name, size in _sizes(present.size).items()}
-    each["smooth"] = np.zeros((seen.size - 2) * present.size * 3)
+    frames, legs = len(scene.frames.dt), len(scene.rig.side)
+    each = {name: np.zeros(frames * size) for name, size in _sizes(legs).items()}
+    each["smooth"] = np.zeros((frames - 2) * legs * 3)
     if kind in kinds:
-        legs = np.ones(1, bool) if kind in ("pelvis", "body") else present
-        active = seen[:, None, None] & legs[:, None] & np.ones(3, bool)
-        each[kind] = active.astype(float).ravel()
+        each[kind] = np.repeat(np.asarray(scene.counts(kind), float), 3, axis=1).ravel()
     return np.concatenate([each[name] for name in (*WHITENED, "smooth")])
 
 

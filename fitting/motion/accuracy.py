@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from fitting.clips.clip import Clip
 from fitting.clips.clip_frames import positions_by_role
-from fitting.problem.residuals import errors_by_kind, rotation_between
+from fitting.problem.residuals import errors_by_kind, over_frames, rotation_between
 from fitting.problem.scene import Scene, animated_legs_ws, legs_ws, pelvis_ws
 from fitting.problem.shared_world import run_scene
 from fitting.runtime.precision import in_float64
@@ -310,9 +310,10 @@ def position_error(ik: jaxik.FootIK, scene: Scene) -> float:
 def _squares(ik: jaxik.FootIK, scene: Scene) -> tuple[Array, Array]:
     """Sum of the squared distances, m², and their number."""
     errors = errors_by_kind(scene, run_scene(ik, scene))
-    observed, legs = scene.reference.observed, jnp.sum(scene.rig.present)
-    each = [
-        jnp.sum(errors[joint].reshape(len(observed), -1) ** 2, axis=1) for joint in FITTED_JOINTS
-    ]
-    total = jnp.sum(jnp.where(observed, sum(each), 0.0))
-    return total, jnp.sum(observed) * (1 + 2 * legs)
+    total, count = jnp.zeros(len(scene.frames.dt)), jnp.zeros((), int)
+    for joint in FITTED_JOINTS:
+        counts = scene.counts(joint)
+        squares = jnp.where(over_frames(counts, errors[joint]), errors[joint] ** 2, 0.0)
+        total = total + jnp.sum(squares.reshape(len(total), -1), axis=1)
+        count = count + jnp.sum(counts)
+    return jnp.sum(total), count

@@ -23,10 +23,10 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from fitting.problem.problem import TAILS, Loss
-from fitting.problem.scene import MEASURED
+from fitting.problem.scene import MEASURED, PER_LEG
 
 from .playback import Playback
-from .worst_window import PER_LEG, SECONDS, window_sums
+from .worst_window import SECONDS, window_sums
 
 Part: TypeAlias = Literal["fitted", "held_out"]
 Motion: TypeAlias = Literal["animation", "before", "fitted"]
@@ -186,9 +186,9 @@ def _rms(
     """Root mean square of the lengths of errors, over frames and present legs of all clips."""
     squares = []
     for values, clip, chosen in zip(errors, clips, frames, strict=True):
-        lengths = np.sum(np.asarray(values)[np.asarray(chosen)] ** 2, axis=-1)
-        squares.append(lengths[:, np.asarray(clip.present) > 0] if kind in PER_LEG else lengths)
-    return float(np.sqrt(np.mean(np.concatenate([square.ravel() for square in squares]))))
+        lengths = np.sum(np.asarray(values) ** 2, axis=-1).reshape(len(chosen), -1)
+        squares.append(lengths[clip.counts(kind, chosen)])
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 @dataclass(frozen=True)
@@ -462,14 +462,12 @@ def series(playback: Playback, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _active(playback: Playback, kind: str) -> Bool[np.ndarray, "frames columns"]:
-    """Which residuals count: of frames that were observed, and of legs that are present."""
+    """Which residuals count: of frames that were observed, and of legs that are fitted."""
     residuals = np.asarray(playback.residuals[kind])
-    seen = np.asarray(playback.seen)
+    counts = playback.counts(kind, playback.seen)
     if kind == "smooth":
-        seen = seen[2:] & seen[1:-1] & seen[:-2]
-    counts = seen.reshape(-1, *[1] * (residuals.ndim - 1))
-    if kind in PER_LEG:
-        counts = counts & np.asarray(playback.present).reshape(-1, *[1] * (residuals.ndim - 2))
+        counts = counts[2:] & counts[1:-1] & counts[:-2]
+    counts = counts.reshape(*counts.shape, *[1] * (residuals.ndim - 2))
     return np.broadcast_to(counts, residuals.shape).reshape(len(residuals), -1)
 
 

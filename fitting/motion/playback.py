@@ -16,7 +16,7 @@ from fitting.inference.optimise import evolution
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind, errors_of_pose, residuals_by_kind
-from fitting.problem.scene import Scene, animated_legs_ws, legs_ws, own_system, pelvis_ws
+from fitting.problem.scene import PER_LEG, Scene, animated_legs_ws, legs_ws, own_system, pelvis_ws
 from fitting.problem.shared_world import groups, in_a_row, moved_out, row_of, run_scenes, split
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64, with_floats
@@ -103,6 +103,8 @@ class Playback(eqx.Module):
     sigmas: Mapping[str, Float[Series, ""]]
     label: str = eqx.field(static=True)
     """The name of the captured motion in pictures."""
+    left_out: Bool[Series, "frames legs"] | None = None
+    """True where a leg counts for nothing; None where all legs count."""
 
     @cached_property
     def time(self) -> Float[np.ndarray, " frames"]:
@@ -119,6 +121,15 @@ class Playback(eqx.Module):
     def fitted_kinds(self) -> list[str]:
         """Kinds of residuals that the fit uses: those whose sigma is finite."""
         return [kind for kind in RESIDUAL_KINDS if np.isfinite(self.sigmas[kind])]
+
+    def counts(self, kind: str, frames: Bool[Series, " frames"]) -> Bool[np.ndarray, "frames n"]:
+        """Where errors of a kind count in some of the frames, for each leg or for the body."""
+        counts = np.asarray(frames)[:, None]
+        if kind in PER_LEG:
+            counts = counts & np.asarray(self.present, bool)
+            if self.left_out is not None:
+                counts = counts & ~np.asarray(self.left_out)
+        return counts
 
     def height(self, points_ws: Float[Series, "*b 3"]) -> Float[np.ndarray, "*b"]:
         """Heights of points along the up axis, m."""
@@ -218,6 +229,7 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         residuals=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
         label=reference.label,
+        left_out=reference.left_out,
     )
 
 

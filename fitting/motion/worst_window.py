@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitting.problem.scene import PER_LEG
+
 from .playback import Playback
 
 SECONDS = 2.0
-PER_LEG = ("ankle", "knee", "foot", "contact", "smooth")  # kinds of residuals that each leg has
 POSITIONS = ("ankle", "knee", "pelvis")  # kinds that are a distance in the world
 TIE = 1e-9  # relative difference below which two windows count as equally bad
 MIN_SEEN = 0.5  # fraction of the window's frames that must have been seen
@@ -148,9 +149,10 @@ def _squares(playback: Playback, kind: str) -> Float[np.ndarray, "frames columns
 
 
 def _sizes(playback: Playback, kind: str) -> Float[np.ndarray, "frames columns"]:
-    """Length of the error of a kind, in the unit of its sigma; 0 in frames that were not seen."""
+    """Length of the error of a kind, in the unit of its sigma; 0 where it does not count."""
     errors = np.abs(np.asarray(playback.errors[kind], np.float64))
-    return np.linalg.norm(_by_frame(errors, kind), axis=-1) * np.asarray(playback.seen)[:, None]
+    counts = playback.counts(kind, playback.seen)
+    return np.linalg.norm(_by_frame(errors, kind), axis=-1) * counts
 
 
 def window_sums(series: Float[np.ndarray, " frames"], length: int) -> Float[np.ndarray, " windows"]:

@@ -1,10 +1,11 @@
 """How far a system's motion is from the reference, as residuals in standard deviations."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 import jaxik
 from jaxik.maths import quat, vec
@@ -14,6 +15,8 @@ from . import capture_system
 from .capture_system import parted
 from .scene import Scene, legs_ws, pelvis_ws
 from .shared_world import groups, run_row, run_scene, scene_in_a_row, split
+
+Values = TypeVar("Values", Array, np.ndarray)
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
@@ -88,32 +91,36 @@ def residuals_by_kind(
 
     Where several clips run in a row, `begins` says which frames are the first of one.
     """
-    observed, sigmas = scene.reference.observed, scene.sigmas
-    follows = _follows(observed, begins)
-    residuals = {}
+    sigmas, residuals = scene.sigmas, {}
     for kind, error in errors.items():
-        sigma = getattr(sigmas, kind)
+        sigma, observed = getattr(sigmas, kind), scene.reference.fitted(kind)
         if kind == "smooth":  # an acceleration takes three frames
+            follows = _follows(observed, begins)
             counts = follows[:-1] & follows[1:]
-            scaled = error / _over_frames(sigma[1:-1] if sigma.ndim else sigma, error)
-            residuals[kind] = jnp.where(counts[:, None, None], scaled, 0.0)
+            scaled = error / over_frames(sigma[1:-1] if sigma.ndim else sigma, error)
+            residuals[kind] = jnp.where(over_frames(counts, error), scaled, 0.0)
         else:
-            scaled, rho = error / _over_frames(sigma, error), sigmas.correlation_of(kind)
-            residuals[kind] = whitened(scaled, observed, _over_frames(rho, error), begins)
+            scaled, rho = error / over_frames(sigma, error), sigmas.correlation_of(kind)
+            residuals[kind] = whitened(scaled, observed, over_frames(rho, error), begins)
     return residuals
 
 
 def _follows(
-    observed: Bool[Array, " frames"], begins: Bool[np.ndarray, " frames"] | None
-) -> Bool[Array, " frames_but_one"]:
+    observed: Bool[Array, " frames *legs"], begins: Bool[np.ndarray, " frames"] | None
+) -> Bool[Array, " frames_but_one *legs"]:
     """Which frames but the first are observed, and follow one of their clip that is, too."""
     both = observed[:-1] & observed[1:]
-    return both if begins is None else both & ~begins[1:]
+    return both if begins is None else both & over_frames(~begins[1:], both)
 
 
-def _over_frames(number: Float[Array, "*#frames"], errors: Float[Array, " frames *r"]) -> Array:
-    """A number of all frames, or one of each, as it is combined with errors."""
-    return number.reshape(*number.shape, *(1,) * (errors.ndim - 1)) if number.ndim else number
+def over_frames(values: Values, errors: Shaped[Array, " frames *r"]) -> Values:
+    """A value of all frames, or of each, or of each leg in each, as errors combine with it.
+
+    Args:
+        values: of shape (), (frames,) or (frames, legs).
+        errors: of frames, and then maybe of legs.
+    """
+    return values.reshape(*values.shape, *(1,) * (errors.ndim - values.ndim))
 
 
 def rotation_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
@@ -127,7 +134,7 @@ def rotation_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[
 
 def whitened(
     residuals: Float[Array, " frames *r"],
-    observed: Bool[Array, " frames"],
+    observed: Bool[Array, " frames *legs"],
     correlation: Float[Array, "*#frames"],
     begins: Bool[np.ndarray, " frames"] | None = None,
 ) -> Float[Array, " frames *r"]:
@@ -137,10 +144,9 @@ def whitened(
     one was, 0 where it was not. They are independent if the errors are a first-order
     autoregression. `begins` is as for `residuals_by_kind`.
     """
-    per_frame = (slice(None),) + (None,) * (residuals.ndim - 1)
-    residuals = jnp.where(observed[per_frame], residuals, 0.0)
+    residuals = jnp.where(over_frames(observed, residuals), residuals, 0.0)
     previous = jnp.concatenate([jnp.zeros_like(residuals[:1]), residuals[:-1]])
     follows = _follows(observed, begins)
     follows = jnp.concatenate([jnp.zeros_like(observed[:1]), follows])
     innovation = (residuals - correlation * previous) / jnp.sqrt(1.0 - correlation**2)
-    return jnp.where(follows[per_frame], innovation, residuals)
+    return jnp.where(over_frames(follows, residuals), innovation, residuals)

@@ -25,6 +25,7 @@ SPREAD = 0.55  # of u: 95 % of such a prior are within half the reach, 2 standar
 
 MEASURED = ("ankle", "knee", "pelvis", "foot", "body")  # kinds that have a noise of their own
 WHITENED = (*MEASURED, "contact")  # kinds whose residuals have a correlation from frame to frame
+PER_LEG = ("ankle", "knee", "foot", "contact", "smooth")  # kinds that each leg has
 # No capture is known better than this: 1 mm, and 0.1 degrees.
 LEAST_SIGMAS = {"ankle": 1e-3, "knee": 1e-3, "pelvis": 1e-3, "foot": 0.00175, "body": 0.00175}
 
@@ -137,6 +138,14 @@ class Reference(eqx.Module):
     """True where the capture was observed, and is not fitted but tests the fit."""
     label: str = eqx.field(static=True, default="captured")
     """Its name in plots."""
+    left_out: Bool[Array, "frames legs"] | None = None
+    """True where a leg neither is fitted nor tests the fit; None where all legs count."""
+
+    def fitted(self, kind: str) -> Bool[Array, " frames *legs"]:
+        """In which frames the residuals of a kind count: for each leg where one is left out."""
+        if self.left_out is None or kind not in PER_LEG:
+            return self.observed
+        return self.observed[:, None] & ~self.left_out
 
 
 class Place(eqx.Module):
@@ -170,6 +179,12 @@ class Scene(eqx.Module):
     place: Place | None = None
     """In a world shared with other scenes, with which it then runs in one loop; None runs alone."""
 
+    def counts(self, kind: str) -> Bool[Array, "frames columns"]:
+        """Where errors of a kind count: of each leg that is present, or one column of the body."""
+        fitted = self.reference.fitted(kind)
+        columns = fitted.reshape(len(fitted), -1)
+        return columns & self.rig.present if kind in PER_LEG else columns
+
 
 def own_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.FootIK:
     """The system as it is for the body of a scene."""
@@ -193,6 +208,7 @@ def left_alone(scene: Scene) -> Scene:
         observed=reference.observed | reference.held_out,
         held_out=jnp.zeros_like(reference.held_out),
         label="animated",
+        left_out=reference.left_out,
     )
     return eqx.tree_at(lambda scene: scene.reference, scene, animated)
 

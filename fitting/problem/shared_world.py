@@ -265,6 +265,8 @@ def _worlds(scenes: Sequence[Scene]) -> list[list[int]]:
 
 def _can_share(a: Scene, b: Scene) -> bool:
     """Whether two clips can run in a row, in one world."""
+    if (a.reference.left_out is None) != (b.reference.left_out is None):
+        return False
     arrays = [(scene.rig.side, scene.frames.platforms.pos[0]) for scene in (a, b)]
     if jax.tree.map(jnp.shape, arrays[0]) != jax.tree.map(jnp.shape, arrays[1]):
         return False

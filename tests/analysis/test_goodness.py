@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fitting.motion import goodness, worst_window
+from fitting.motion import goodness
 from fitting.motion.goodness import MEDIAN, Assumed, Verdict, measure_groups
 from fitting.motion.playback import RESIDUAL_KINDS, Playback
 from fitting.motion.worst_window import find_worst_window
-from fitting.problem.scene import Sigmas
+from fitting.problem.scene import PER_LEG, Sigmas
 from fitting.problem.simulation import autoregression
 from support.playbacks import FPS, FRAMES, SHAPES, SIGMAS, error, playback
 
@@ -167,7 +167,7 @@ def test_p_values_are_uniform_where_the_noise_is_as_assumed():
 def test_the_worst_window_knows_every_kind_of_residual():
     sigmas = {field.name for field in dataclasses.fields(Sigmas)} - {"correlation"}
     assert set(SHAPES) == set(RESIDUAL_KINDS) == sigmas
-    assert set(worst_window.PER_LEG) == set(RESIDUAL_KINDS) - {"pelvis", "body"}
+    assert set(PER_LEG) == set(RESIDUAL_KINDS) - {"pelvis", "body"}
     window = find_worst_window(playback())  # of a perfect fit
     assert window.rms == 0.0 and window.size == 0.0 and window.leg_fractions.sum() == 0.0
 

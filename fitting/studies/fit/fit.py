@@ -455,7 +455,8 @@ def _play_beside(
     playbacks = []
     for reference, scene, result in zip(references, scenes, results, strict=True):
         own = scene.reference
-        beside = dataclasses.replace(reference, observed=own.observed, held_out=own.held_out)
+        counted = ("observed", "held_out", "left_out")
+        beside = dataclasses.replace(reference, **{name: getattr(own, name) for name in counted})
         scene = eqx.tree_at(lambda scene: scene.reference, scene, beside)
         playbacks.append(playback.play(scene, result))
     return tuple(playbacks)

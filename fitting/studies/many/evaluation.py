@@ -27,7 +27,7 @@ from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
 from fitting.inference.sharding import EVERYWHERE
 from fitting.problem import shared_world
-from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.problem.residuals import errors_by_kind, over_frames, residuals_by_kind
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
 from fitting.runtime import activity
@@ -62,13 +62,11 @@ def errors_and_cost(scene: Scene, result: jaxik.Result) -> dict[str, Float[Array
     The cost is half the sum of the squared residuals, without any prior.
     """
     errors = errors_by_kind(scene, result)
-    seen = scene.reference.observed
-    present = jnp.sum(scene.rig.present)
     measured = {}
     for name in KINDS:
-        squares = jnp.where(seen.reshape(-1, *[1] * (errors[name].ndim - 1)), errors[name] ** 2, 0)
-        each = present if errors[name].ndim == 3 else 1
-        measured[name] = jnp.sqrt(jnp.sum(squares) / jnp.maximum(jnp.sum(seen) * each, 1))
+        counts = scene.counts(name)
+        squares = jnp.where(over_frames(counts, errors[name]), errors[name] ** 2, 0)
+        measured[name] = jnp.sqrt(jnp.sum(squares) / jnp.maximum(jnp.sum(counts), 1))
     residuals = residuals_by_kind(scene, errors)
     measured["cost"] = 0.5 * sum((jnp.sum(r**2) for r in residuals.values()), jnp.zeros(()))
     return measured

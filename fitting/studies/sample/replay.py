@@ -25,10 +25,9 @@ from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood
 from fitting.inference.sample.posterior import Posterior
 from fitting.motion import goodness, playback
 from fitting.motion.playback import RESIDUAL_KINDS, Playback
-from fitting.motion.worst_window import PER_LEG
 from fitting.problem.capture_system import system_and_scenes
 from fitting.problem.problem import Problem
-from fitting.problem.scene import MEASURED, Scene
+from fitting.problem.scene import MEASURED, PER_LEG, Scene
 from fitting.problem.simulation import correlated
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
