@@ -189,6 +189,11 @@ class Clip:
                 stance[first : last + 1] = self.observed[first : last + 1].any()
         return labels
 
+    def fitted_stances(self) -> Bool[np.ndarray, "frames legs"]:
+        """`stance_labels` without the stances that the fit leaves out."""
+        labels = self.stance_labels()
+        return labels if self.left_out is None else labels & ~self.left_out
+
     def leg_pose_ws(self) -> LegPose:
         """World transforms of the legs' joints, (frames, legs), in JAX's default precision."""
         joints = np.array(self.rig.joints)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jaxik
 from fitting.clips import Clip
 from fitting.clips.load import ClipOptions
+from fitting.clips.stances import contacts_path
 from fitting.ground.ground_path import Root
 from fitting.ground.meshes import TerrainOptions
 from fitting.inference.noise import NoiseOptions
@@ -102,6 +103,12 @@ class ClipEntry(TerrainOptions, ClipOptions):
         """The files that are named, by key."""
         values = {name: getattr(self, name) for name in keys(ClipEntry)}
         return {name: value for name, value in values.items() if isinstance(value, Path)}
+
+    @property
+    def contacts_files(self) -> tuple[Path, ...]:
+        """The contacts files beside its clips, which no key names."""
+        beside = [contacts_path(clip) for clip in (self.reference, self.base) if clip is not None]
+        return tuple(path for path in dict.fromkeys(beside) if path.exists())
 
     def with_paths(self, change: Callable[[Path], Path]) -> "ClipEntry":
         """The entry with each of its paths changed."""

@@ -608,7 +608,7 @@ def find_stances(clip: Clip, sole: float) -> Stances:
 
     They are medians over the frames in which the foot is stillest, without frames in which a marker
     jumped. A foot on its toes often leans on an edge or hangs over one, so it is used only if no
-    flat stance is near.
+    flat stance is near. What the fit leaves out is not used.
 
     Raises:
         ValueError: no foot ever stands.
@@ -640,8 +640,8 @@ def find_stances(clip: Clip, sole: float) -> Stances:
     distance_to_flat = np.full(len(points), np.inf)
     if not toes.all():
         distance_to_flat, _ = KDTree(points[~toes]).query(points)
-    used = ~toes | (distance_to_flat > NEAR)
     leg, first, last = (column.astype(np.int64) for column in (leg, first, last))
+    used = (~toes | (distance_to_flat > NEAR)) & clip.fitted_stances()[first, leg]
     return Stances(leg, first, last, points, ankles, y - sole, toes, used)
 
 

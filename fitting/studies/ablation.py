@@ -323,7 +323,7 @@ def _digest(entries: Sequence[ClipEntry]) -> str:
     for entry in entries:
         joints = entry.joints if isinstance(entry.joints, Path) else None
         paths = (entry.reference, entry.base, entry.terrain, entry.tracks, joints, entry.asf)
-        for path in paths:
+        for path in (*paths, *entry.contacts_files):
             digest.update(b"" if path is None else hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 

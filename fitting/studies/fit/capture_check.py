@@ -93,9 +93,7 @@ def check(clips: Sequence[ClipData]) -> CaptureCheck:
 def measure_stances(data: ClipData) -> Stances:
     """The stances of a clip over its ground that are fitted; none where no foot stands."""
     clip, height_under = data.reference, meshes.height_function(data.terrain)
-    standing, balls = clip.observed_stances(), clip.joints_ws(3)
-    if clip.left_out is not None:
-        standing &= ~clip.left_out
+    standing, balls = clip.observed_stances() & clip.fitted_stances(), clip.joints_ws(3)
     places = [
         (first, last, leg)
         for leg in range(standing.shape[1])
@@ -316,7 +314,7 @@ def _of_ground(clip: ClipData) -> GroundOffset:
     captured = with_soles_of(clip.reference, clip.base)
     feet = measures.soles(captured, clip.base, clip.terrain)
     places = feet.points_ws.mean(axis=2)[..., [0, 2]]
-    return measure_ground(feet.gap, places, clip.reference.stance_labels())
+    return measure_ground(feet.gap, places, clip.reference.fitted_stances())
 
 
 def measure_lag(clip: Playback) -> float:

@@ -121,7 +121,7 @@ class FitTask:
         contents = [
             _digest(value)
             for entry in self.experiment.clips
-            for value in clip_to_table(entry).values()
+            for value in (*clip_to_table(entry).values(), *entry.contacts_files)
             if isinstance(value, Path)
         ]
         return hashlib.sha256(repr((text, contents)).encode()).hexdigest()
