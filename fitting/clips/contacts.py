@@ -81,7 +81,8 @@ def stance_probability(
     """How probable each detected stance is, in each of its frames; 0 in swings.
 
     It is the probability that the right limits of speed, duration and hanging height, which are
-    known to within a factor or so, let it pass, as if they were independent. Ends are not judged.
+    known to within a factor or so, let it pass, as if they were independent. How long a stance is
+    that the clip cuts off is not known. When it begins and ends is not judged.
 
     Args:
         ball_ws: position of the ball of each foot, m, y up.
@@ -96,7 +97,8 @@ def stance_probability(
         for first, last in runs(stance[:, leg]):
             frames = slice(first, last + 1)
             slowness = speed_limit(size) / max(float(np.median(speed[frames, leg])), 1e-9)
-            duration = (last - first + 1) / (fps * MIN_STANCE)
+            is_cut = first == 0 or last == len(stance) - 1
+            duration = np.inf if is_cut else (last - first + 1) / (fps * MIN_STANCE)
             hang = _hang(smooth_ws[:, leg, 1] / size, first, last, window)
             deviations = (
                 np.log(slowness) / SPEED_DOUBT,

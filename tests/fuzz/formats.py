@@ -18,6 +18,7 @@ from fitting.clips import load_clip, save_clip
 from fitting.clips.clip import Clip
 from fitting.clips.edit import mask_marker_jumps
 from fitting.clips.joint_maps import template
+from fitting.clips.stances import Stance, stances_of, to_toml, with_stances
 from fitting.experiment import originals, parameter_files, record_files, track_files
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import load_known_values
@@ -139,12 +140,19 @@ class Format:
         return (self.file, *self.beside)
 
 
+def short_walk() -> Clip:
+    """A third of a second with all tracks, in which a stance is by hand and left out."""
+    clip = mask_marker_jumps(stair_walk()).select(slice(0, 20))
+    stances = stances_of(clip)
+    return with_stances(clip, {**stances, "left": (Stance(0.1, 0.2, left_out=True),)})
+
+
 @cache
 def clip_bytes(suffix: str) -> bytes:
     """A clip as we write it, with all tracks that the format has."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"clip{suffix}"
-        save_clip(path, mask_marker_jumps(stair_walk()).select(slice(0, 20)))
+        save_clip(path, short_walk())
         return path.read_bytes()
 
 
@@ -293,6 +301,13 @@ FORMATS: dict[str, Format] = {
         lambda path: soundness.check_clip(load_clip(path.with_name("walk.bvh"), joints=path)),
         damage_toml,
         beside={"walk.bvh": BVH.encode},
+    ),
+    "contacts": Format(
+        "walk.contacts.toml",
+        lambda: to_toml(short_walk()).encode(),
+        lambda path: soundness.check_clip(load_clip(path.with_name("walk.npz"))),
+        damage_toml,
+        beside={"walk.npz": partial(clip_bytes, ".npz")},
     ),
     "mesh, PLY text": mesh_format("ply", damage_text, encoding="ascii"),
     "mesh, PLY": mesh_format("ply", damage_bytes),
