@@ -20,7 +20,7 @@ from fitting.motion import measures
 from fitting.motion.measures import PlacedMotion
 from jaxik.world import body
 
-from . import live_data, style
+from . import bodies, live_data, style
 from .live_data import LiveClip
 
 MAX_RATE = 60.0  # frames per second that are shown
@@ -37,16 +37,16 @@ class Appearance(NamedTuple):
 
     colour: str
     """As `#rrggbb`."""
-    radius: float
-    """Of its bones, m for an adult."""
+    thickness: float = 1.0
+    """Of its body."""
     opacity: float = 1.0
     """Below 1 it is a shell of glass."""
 
 
-ANIMATED = Appearance(style.SLIDING, 0.012)
-BEFORE = Appearance(style.BEFORE, 0.015)
-CAPTURED = Appearance(style.CAPTURED, 0.034, 0.1)  # around what should be inside it
-FITTED = Appearance(style.AFTER, 0.02)
+ANIMATED = Appearance(style.SLIDING, 0.8)
+BEFORE = Appearance(style.BEFORE, 0.9)
+CAPTURED = Appearance(style.CAPTURED, 1.12, 0.1)  # around what should be inside it
+FITTED = Appearance(style.AFTER)
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
     soles = [[joints + 2 * leg, joints + 2 * leg + 1] for leg in range(len(clip.rig.names))]
     return {
         "points": points.shape[1],
-        "bones": [[parent, j] for j, parent in enumerate(clip.parents) if parent >= 0],
+        "shape": bodies.pack(clip),
         "pelvis": clip.rig.pelvis,
         "legs": [list(map(int, leg)) for leg in clip.rig.joints],
         "soles": soles,

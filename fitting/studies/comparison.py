@@ -79,7 +79,7 @@ Dashes: TypeAlias = Literal["-", "--", ":"]
 DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
 BAR_PANELS = 4  # in a row, wide enough for their titles
 
-RADIUS = 0.018  # m, of the bones of a system
+THICKNESS = 0.9  # of the body of a system
 CAPTURE = "captured"  # key of the captured motion, which no system has
 UNKNOWN = Bounded("", 0.0, "nothing is known of its feet")
 MARKED = "What is marked (!) is beyond its bound."
@@ -684,7 +684,7 @@ def viewed_clip(
     """
     flat = motion_data.ANIMATED._replace(colour=BEFORE)
     appearances = {ANIMATED: flat} | {
-        name: Appearance(COLOURS[index % len(COLOURS)], RADIUS)
+        name: Appearance(COLOURS[index % len(COLOURS)], THICKNESS)
         for index, name in enumerate(systems)
     }
     motions = {

@@ -138,10 +138,10 @@ def test_the_view_is_drawn_and_changes_with_the_legend_and_the_camera(open_page)
     assert len({bytes(picture) for picture in pictures}) >= len(pictures) - 1  # corner is the first
 
 
-def test_all_bones_throw_a_shadow_however_many_there_are(open_page, path, tmp_path):
+def test_all_limbs_throw_a_shadow_however_many_there_are(open_page, path, tmp_path):
     data = Page(path).data
-    bones = data["clips"][0]["skeletons"][-1]["bones"]
-    bones[:0] = 70 * bones[:1]
+    limbs = data["clips"][0]["skeletons"][-1]["shape"]["limbs"]
+    limbs[:0] = 70 * limbs[:1]
     crowded = tmp_path / "crowded.html"
     whole = path.read_text()
     start = whole.index(">", whole.index('id="data"')) + 1

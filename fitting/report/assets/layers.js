@@ -4,6 +4,11 @@ const TRAIL = 1; // s, before and after the moment that is shown
 const THIN = 0.006; // m, radius of a line for an adult
 const STEP = 0.012; // m, between points of a trail
 
+// A capsule as the stage takes it.
+function addCapsule(fields, start, end, colour, opacity, radius) {
+  fields.push(...start, ...end, ...colour, opacity, radius);
+}
+
 class Layers {
   constructor(player) {
     this.player = player;
@@ -38,7 +43,7 @@ class Layers {
         addCapsule(fields, start, end, [r / 255, g / 255, b / 255], 1, radius);
       }
     }
-    return fields;
+    return new Float32Array(fields);
   }
 
   addTrail(fields, skeleton, ball, time, radius) {

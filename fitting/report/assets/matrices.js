@@ -9,6 +9,7 @@ const cross = (a, b) => [
   a[2] * b[0] - a[0] * b[2],
   a[0] * b[1] - a[1] * b[0],
 ];
+const mix = (a, b, share) => [0, 1, 2].map((i) => a[i] + share * (b[i] - a[i]));
 const normalise = (a) => scale(a, 1 / (Math.hypot(...a) || 1));
 
 function perspective(fieldOfView, aspect, near, far) {

@@ -15,8 +15,6 @@ class Skeleton {
     this.offsets = new Int16Array(bytesOf(packed.offsets));
     this.packedGap = Float32Array.from(new Int16Array(bytesOf(packed.gap)), (step) => (step === NO_GAP ? NaN : 1e-4 * step));
     this.show(null);
-    this.footBones = new Map(); // leg by bone, "parent-child"
-    packed.legs.forEach((joints, leg) => this.footBones.set(`${joints[2]}-${joints[3]}`, leg));
     this.legCount = legs;
     this.positions = new Float32Array(3 * packed.points);
   }
@@ -67,6 +65,15 @@ class Skeleton {
 
   isSunk(frame, leg) {
     return this.gap[this.legCount * frame + leg] < -this.visibleDepth;
+  }
+
+  // How far a foot has the colour of what is wrong, 0 to 1.
+  footShare(leg, time) {
+    return this.sunkLegs(time)[leg] ? 1 : 0;
+  }
+
+  footColour(leg, time, palette) {
+    return mix(palette[this.key], palette.sunk, this.footShare(leg, time));
   }
 }
 

@@ -1,11 +1,7 @@
-// Draws ground and skeletons with WebGL 2.
+// Draws ground and bodies with WebGL 2.
 
 const HIDDEN = 0.22; // strength of what is behind or in the ground
-const FIELDS_OF_BONE = 11; // start, end, colour with opacity, radius
-
-function addCapsule(fields, start, end, colour, opacity, radius) {
-  fields.push(...start, ...end, ...colour, opacity, radius);
-}
+const LAYOUT = [["start", 3], ["end", 3], ["tint", 4], ["radii", 3], ["across", 3], ["more", 2]]; // of instances
 
 class Stage {
   constructor(canvas) {
@@ -14,8 +10,9 @@ class Stage {
     if (!this.gl) return;
     const gl = this.gl;
     this.groundProgram = this.program(GROUND_VERTICES, GROUND_COLOURS);
-    this.boneProgram = this.program(BONE_VERTICES, BONE_COLOURS);
-    this.bones = this.boneBuffers();
+    this.bodyProgram = this.program(BODY_VERTICES, BODY_COLOURS);
+    this.limbs = this.bodyBuffers(capsule());
+    this.slabs = this.bodyBuffers(slab());
     this.shadowTexture = this.texture();
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -50,28 +47,28 @@ class Stage {
     return buffer;
   }
 
-  attribute(program, name, size, stride = 0, offset = 0, perBone = 0) {
+  attribute(program, name, size, stride = 0, offset = 0, perInstance = 0) {
     const gl = this.gl;
     const place = program.attribute(name);
     gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, size, gl.FLOAT, false, stride, offset);
-    gl.vertexAttribDivisor(place, perBone);
+    gl.vertexAttribPointer(place, size, gl.FLOAT, false, 4 * stride, 4 * offset);
+    gl.vertexAttribDivisor(place, perInstance);
   }
 
-  boneBuffers() {
+  bodyBuffers({ vertices: corners, triangles }) {
     const gl = this.gl;
-    const { corners, triangles } = capsule();
     const vertices = gl.createVertexArray();
     gl.bindVertexArray(vertices);
     this.buffer(corners);
-    this.attribute(this.boneProgram, "corner", 4);
+    this.attribute(this.bodyProgram, "corner", 4, 7);
+    this.attribute(this.bodyProgram, "facing", 3, 7, 4);
     const instances = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, instances);
-    const stride = 4 * FIELDS_OF_BONE;
-    this.attribute(this.boneProgram, "start", 3, stride, 0, 1);
-    this.attribute(this.boneProgram, "end", 3, stride, 12, 1);
-    this.attribute(this.boneProgram, "tint", 4, stride, 24, 1);
-    this.attribute(this.boneProgram, "radius", 1, stride, 40, 1);
+    let offset = 0;
+    for (const [name, size] of LAYOUT) {
+      this.attribute(this.bodyProgram, name, size, FIELDS, offset, 1);
+      offset += size;
+    }
     this.buffer(triangles, gl.ELEMENT_ARRAY_BUFFER);
     return { vertices, instances, count: triangles.length };
   }
@@ -114,19 +111,25 @@ class Stage {
   }
 
   // Draws posed skeletons, the one that throws the shadow last; `palette` has colours of 0 to 1 by name.
-  draw(skeletons, time, camera, palette, segments = []) {
+  // `segments` are further capsules: start, end, colour, opacity and radius of each.
+  draw(skeletons, time, camera, palette, segments = null) {
     const gl = this.gl;
     const view = camera.matrix(this.resize());
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(...palette.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.drawGround(skeletons, view, camera, palette);
-    const opaqueFirst = [...skeletons].sort((a, b) => b.opacity - a.opacity);
-    for (const skeleton of opaqueFirst) this.drawSkeleton(skeleton, time, view, camera, palette);
-    this.drawCapsules(new Float32Array(segments), view, camera);
+    const figures = skeletons.map((skeleton) => figure(skeleton, time, palette, this.ground.size));
+    this.drawGround(skeletons.at(-1), figures.at(-1), view, camera, palette);
+    const opaqueFirst = figures.map((_, i) => i).sort((a, b) => skeletons[b].opacity - skeletons[a].opacity);
+    for (const i of opaqueFirst) this.drawBody(figures[i], view, camera);
+    if (segments?.length) {
+      const capsules = new Instances();
+      capsules.addSegments(segments);
+      this.drawBody(capsules, view, camera);
+    }
   }
 
-  drawGround(skeletons, view, camera, palette) {
+  drawGround(thrower, body, view, camera, palette) {
     const gl = this.gl, { program, uniform } = this.groundProgram, { ground } = this;
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniform("view"), false, view);
@@ -136,83 +139,69 @@ class Stage {
     gl.uniform2f(uniform("heights"), ground.lowest, ground.highest);
     gl.uniform1f(uniform("reach"), Math.max(6 * ground.size, 2.2 * camera.distance));
     gl.uniform1f(uniform("size"), ground.size);
-    this.setShadows(skeletons.at(-1), uniform);
+    this.setShadows(thrower, body, uniform);
     gl.enable(gl.BLEND);
     gl.bindVertexArray(this.groundVertices);
     gl.drawElements(gl.TRIANGLES, ground.triangles.length, gl.UNSIGNED_INT, 0);
   }
 
-  // All bones of a skeleton, if there is one, for the shader of the ground.
-  setShadows(thrower, uniform) {
+  // The limbs of a skeleton, if there is one, for the shader of the ground.
+  setShadows(thrower, body, uniform) {
     const gl = this.gl;
-    const bones = thrower?.bones ?? [];
-    const points = new Float32Array(bones.flatMap(([a, b]) => [...thrower.point(a), 0, ...thrower.point(b), 0]));
+    const limbs = body?.limbs ?? [], count = limbs.length / FIELDS;
+    const points = new Float32Array(8 * count);
+    for (let i = 0; i < count; i++) {
+      const at = FIELDS * i;
+      points.set([...limbs.slice(at, at + 3), 0.7 * limbs[at + 11], ...limbs.slice(at + 3, at + 6), 0], 8 * i);
+    }
     gl.bindTexture(gl.TEXTURE_2D, this.shadowTexture);
-    if (bones.length) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 2, bones.length, 0, gl.RGBA, gl.FLOAT, points);
-    gl.uniform1i(uniform("bones"), 0);
-    gl.uniform1i(uniform("shadows"), bones.length);
+    if (count) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 2, count, 0, gl.RGBA, gl.FLOAT, points);
+    gl.uniform1i(uniform("limbs"), 0);
+    gl.uniform1i(uniform("shadows"), count);
     const [x, , z] = thrower ? thrower.point(thrower.pelvis) : [0, 0, 0];
     let reach = 0, highest = -Infinity;
     for (let i = 0; i < points.length; i += 4) {
       reach = Math.max(reach, Math.hypot(points[i] - x, points[i + 2] - z));
       highest = Math.max(highest, points[i + 1]);
     }
-    const softness = 0.035 * this.ground.size + 0.09 * Math.max(highest - this.ground.lowest, 0);
+    const softness = 0.12 * this.ground.size + 0.09 * Math.max(highest - this.ground.lowest, 0);
     gl.uniform3f(uniform("middle"), x, z, reach + softness);
   }
 
-  drawSkeleton(skeleton, time, view, camera, palette) {
-    this.drawCapsules(this.instances(skeleton, skeleton.sunkLegs(time), palette), view, camera);
-  }
-
-  drawCapsules(instances, view, camera) {
-    const gl = this.gl, { program, uniform } = this.boneProgram;
+  drawBody(figure, view, camera) {
+    const gl = this.gl, { program, uniform } = this.bodyProgram;
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniform("view"), false, view);
     gl.uniform3fv(uniform("light"), LIGHT);
     gl.uniform3fv(uniform("eye"), camera.eye);
-    gl.bindVertexArray(this.bones.vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.bones.instances);
-    gl.bufferData(gl.ARRAY_BUFFER, instances, gl.DYNAMIC_DRAW);
-    const count = instances.length / FIELDS_OF_BONE;
-    const drawBones = () =>
-      gl.drawElementsInstanced(gl.TRIANGLES, this.bones.count, gl.UNSIGNED_SHORT, 0, count);
+    const kinds = [[this.limbs, figure.limbs, 0], [this.slabs, figure.slabs, 1]];
+    for (const [buffers, numbers] of kinds) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffers.instances);
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(numbers), gl.DYNAMIC_DRAW);
+    }
+    const drawAll = () => {
+      for (const [{ vertices, count }, numbers, isSlab] of kinds) {
+        if (!numbers.length) continue;
+        gl.uniform1i(uniform("isSlab"), isSlab);
+        gl.bindVertexArray(vertices);
+        gl.drawElementsInstanced(gl.TRIANGLES, count, gl.UNSIGNED_SHORT, 0, numbers.length / FIELDS);
+      }
+    };
     gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE);
     gl.uniform1f(uniform("strength"), HIDDEN); // first what the ground hides
     gl.depthMask(false);
     gl.depthFunc(gl.GREATER);
-    drawBones();
+    drawAll();
     gl.depthMask(true);
     gl.depthFunc(gl.LESS);
     gl.colorMask(false, false, false, false); // then depth alone: a shell shows no inner surface
-    drawBones();
+    drawAll();
     gl.colorMask(true, true, true, true);
     gl.depthFunc(gl.LEQUAL);
     gl.uniform1f(uniform("strength"), 1);
-    drawBones();
+    drawAll();
     gl.depthFunc(gl.LESS);
-  }
-
-  // Bones, soles and lines from the foot's joints to its sole, red where the foot is in the ground.
-  instances(skeleton, sunk, palette) {
-    const size = this.ground.size;
-    const colour = palette[skeleton.key];
-    const bones = [];
-    const bone = (a, b, inGround, thickness = 1) => {
-      const radius = size * skeleton.radius * thickness * (inGround ? 1.4 : 1);
-      const opacity = inGround ? 1 : skeleton.opacity;
-      bones.push(...skeleton.point(a), ...skeleton.point(b), ...(inGround ? palette.sunk : colour), opacity, radius);
-    };
-    for (const [a, b] of skeleton.bones) {
-      const leg = skeleton.footBones.get(`${a}-${b}`);
-      bone(a, b, leg !== undefined && sunk[leg]);
-    }
-    skeleton.soles.forEach(([heel, ball], leg) => {
-      const [, , ankle, toe] = skeleton.legs[leg];
-      bone(heel, ball, sunk[leg], 0.6);
-      bone(ankle, heel, sunk[leg], 0.45);
-      bone(toe, ball, sunk[leg], 0.45);
-    });
-    return new Float32Array(bones);
+    gl.disable(gl.CULL_FACE);
   }
 }
