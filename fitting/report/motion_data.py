@@ -150,7 +150,7 @@ def _pack_clip(
         "legs": list(reference.rig.names),
         "forward": _travel(reference.positions_ws[:, reference.rig.pelvis]),
         "stance": _bytes(_any_of(clip.stance, step)),
-        "flatPath": _base64(_path(clip.flat)[::step].astype("<f4")),
+        "flatPath": _base64(_path(clip.flat, step).astype("<f4")),
         "watched": clip.watched,
         "corner": corner.tolist(),
         "step": step,
@@ -260,9 +260,12 @@ def _rounded(gap: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(tenths), NO_GAP, np.nan_to_num(tenths)).astype("<i2")
 
 
-def _path(clip: Clip) -> np.ndarray:
-    """How far each ball has gone over the ground since the clip began, m: (frames, legs)."""
-    steps = measures.horizontal_steps(clip.joints_ws(3), clip.cuts)
+def _path(clip: Clip, step: int) -> np.ndarray:
+    """How far each ball has gone over the ground since the clip began, m, in every `step`-th frame.
+
+    The page takes the paths of other motions from the same frames.
+    """
+    steps = measures.horizontal_steps(clip.joints_ws(3)[::step])
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
 
 

@@ -32,11 +32,12 @@ from fitting.clips.formats.saving import check_clip_file
 from fitting.clips.joint_maps import Trunk, find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
-from fitting.ground import coverage
+from fitting.ground import coverage, meshes
 from fitting.ground.ground_path import AS_ANIMATED, Root, RootChoice, place_root
 from fitting.ground.meshes import TerrainOptions, mesh_of
 from fitting.motion import accuracy, measures
 from fitting.motion.flat_animation import (
+    flatten_clip,
     load_flat_animation,
     with_cut_off_swings,
     with_remark_if_uneven,
@@ -272,27 +273,34 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     if has_other_path(files):
         clip = in_direction(at_speed(clip, files.speed), files.direction)
     placed, root = place_root(clip, terrain, files.root, files.floor)
-    # Where the clip follows this terrain, its ground has been taken out.
-    clip = with_remark_if_uneven(clip) if placed is clip else placed
-    captured = _captured(files, placed)
+    floor, follows = files.floor, placed is not clip
+    if follows:
+        heights, normals = meshes.height_function(terrain), meshes.normal_function(terrain)
+        clip, floor = flatten_clip(clip, heights, normal_under=normals), 0.0
+        clip, root = place_root(clip, terrain, files.root)
+        taken_out = "the ground was taken out of the clip, which follows it"
+        root = replace(root, reason=f"{root.reason}; {taken_out}")
+    else:
+        clip = with_remark_if_uneven(clip)
+    captured = _captured(files, follows)
     clip, tracks = track_files.along(clip, files.tracks)
     return Animation(
-        clip, terrain, files.floor, root, speed=files.speed, direction=files.direction,
+        clip, terrain, floor, root, speed=files.speed, direction=files.direction,
         tracks=tracks, captured=captured, files=files,
     )  # fmt: skip
 
 
-def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:
+def _captured(files: AnimationFiles, follows: bool) -> Clip | None:
     """The captured motion of an animation, where the file of the clip has it.
 
-    It may hold both motions, or a clip that follows the terrain, from which the ground was taken
-    out. On another path, neither has the captured one.
+    It may hold both motions, or a clip that follows the terrain. On another path, neither has the
+    captured one.
     """
     if has_other_path(files):
         return None
     if holds_base(files.clip):
         return load_clip(files.clip)
-    return None if placed is files.flat_clip else files.flat_clip
+    return files.flat_clip if follows else None
 
 
 def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:

@@ -26,7 +26,7 @@ import jaxik
 from fitting.report import live_data, motion_data, pages
 from fitting.runtime.validation import Content
 
-from . import tuning
+from . import contact_edits, tuning
 from .session import Session
 from .solving import LAYERS, Solved, Solver
 from .tuning import Tuning
@@ -63,6 +63,7 @@ class Viewer:
         self._clips: dict[int, Content] = {}
         self._lock = threading.RLock()  # of what computes
         self._news, self._changed = News(), threading.Condition()
+        self._ready = threading.Event()
         threading.Thread(target=self._prepare, name="jaxik view: first clip", daemon=True).start()
 
     def _prepare(self) -> None:
@@ -71,19 +72,23 @@ class Viewer:
             self.clip(0)
         except (ValueError, RuntimeError):
             pass  # the browser is told, which asks for it again
+        finally:
+            self._ready.set()
 
     def page(self) -> str:
-        """The page, with its first clip."""
+        """The page, with its first clip; until that is solved one that asks again."""
         session = self.session
-        visible = session.clips[0].animation.place(session.clips[0].animation.placed_clip)
+        if not self._ready.is_set():
+            return pages.render("waiting.html", [], title=session.title)
+        first = self.clip(0)
         return pages.render(
             "live.html",
-            [self.clip(0), *[None] * (len(session.clips) - 1)],
+            [first, *[None] * (len(session.clips) - 1)],
             is_remote=True,
             kind="Move parameters, and see the motion",
             title=session.title,
             names=[clip.name for clip in session.clips],
-            visible=f"{100 * visible.measures.visible:.2g} cm",
+            visible=f"{100 * first['visibleDepth']:.2g} cm",
             stands="captured" if session.clips[0].animation.captured else "animated",
             layers=LAYERS,
         )
@@ -96,8 +101,13 @@ class Viewer:
         """
         with self._lock:
             if number not in self._clips:
-                (content,) = motion_data.pack([self._solver(number).viewed()])
-                self._clips[number] = content | {"live": self.tuning.content()}
+                solver = self._solver(number)
+                (content,) = motion_data.pack([solver.viewed()])
+                content |= {"live": self.tuning.content()}
+                if self.session.reload is not None:
+                    clip = solver.clip
+                    content["contacts"] = contact_edits.pack(clip.labelled, clip.data)
+                self._clips[number] = content
             return self._clips[number]
 
     def _solver(self, number: int) -> Solver:
@@ -127,6 +137,23 @@ class Viewer:
         with self._lock:
             ik = self._system(request)
             return tuning.save(self.folder, ik, session.preset, session.leg_length, drop=drop)
+
+    def save_contacts(self, request: Content) -> Content:
+        """Writes the stances of a clip; the clip as it is read with them, and a message.
+
+        Raises:
+            ValueError: a stance is none, or a file cannot be written or read with them.
+        """
+        number, legs = _field(request, "clip", int), _field(request, "legs", list)
+        with self._lock:
+            clip = self._solver(number).clip
+            if self.session.reload is None:
+                raise ValueError("stances cannot be put right while a fit goes on")
+            message = contact_edits.save(clip.files, clip.labelled, legs)
+            self.session = self.session.reload()
+            self.tuning = Tuning(self.session)
+            self._solvers, self._clips = {}, {}
+            return {"clip": self.clip(number), "message": message}
 
     def _system(self, request: Content) -> jaxik.FootIK:
         return self.tuning.system(live_data.unpacked_doubles(_field(request, "values", str)))
@@ -205,6 +232,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
         actions: Mapping[str, Callable[[Content], Answer]] = {
             "/solve": lambda request: Answer(viewer.solve(request), BYTES),
             "/save": lambda request: _json(viewer.save(request)),
+            "/contacts": lambda request: _json(viewer.save_contacts(request)),
         }
         length = int(self.headers.get("Content-Length") or 0)
         if not 0 < length <= MAX_REQUEST:

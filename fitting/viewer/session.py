@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxik
+from fitting.clips import Clip
 from fitting.experiment import problems, systems
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.problems import ClipData
@@ -27,6 +28,8 @@ from fitting.runtime.program_cache import cached
 from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
 
+from .contact_edits import ClipFile
+
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to
 Cost = Callable[[jaxik.FootIK], Float[Array, ""]]
 
@@ -40,6 +43,16 @@ class SessionClip:
     """On a terrain as the rays of the system need it."""
     size: Float[Array, ""] | None = None
     """Of the body over the one that the numbers are for; see `Scene`."""
+    data: ClipData | None = None
+    """The captured motion on its ground, where it is known."""
+    files: tuple[ClipFile, ...] = ()
+    """That have its stances; none where they cannot be put right."""
+
+    @property
+    def labelled(self) -> Clip:
+        """The motion whose stances the page shows."""
+        own = self.animation
+        return own.clip if own.captured is None else own.captured
 
 
 @dataclass(frozen=True)
@@ -58,6 +71,8 @@ class Session:
     """m, of the body that the numbers are for; None if they fit any body as they are."""
     cost: Cost | None = None
     """How far a system's motion is from the captured one; None where there is none."""
+    reload: "Callable[[], Session] | None" = None
+    """Reads everything anew, after stances were put right; None where they cannot be."""
 
     @property
     def rig(self) -> jaxik.Rig:
@@ -93,7 +108,10 @@ def session_of_run(run: Path) -> Session:
     values = {row["name"]: row["u"] for row in summary["parameters"]}
     u = np.array([values[name] for name in problem.space.names])
     session = session_of_fit(experiment, problem, clips, u)
-    return with_start(session, FITTED, alone(problem.space.unpack(u)))
+    session = with_start(session, FITTED, alone(problem.space.unpack(u)))
+    if any(entry.loaded is not None for entry in experiment.clips):
+        return session
+    return replace(session, reload=partial(session_of_run, run))
 
 
 @in_float64
@@ -128,8 +146,16 @@ def session_of_fit(
                 captured=with_soles_of(clip.reference, clip.base),
             ),
             size=scene.size,
+            data=clip,
+            files=tuple(
+                ClipFile(path, entry.of_file(path))
+                for path in (entry.reference, entry.base)
+                if path is not None
+            ),
         )
-        for number, (clip, scene) in enumerate(zip(clips, scenes, strict=True), 1)
+        for number, (entry, clip, scene) in enumerate(
+            zip(experiment.clips, clips, scenes, strict=True), 1
+        )
     )
     cost = partial(cost_of_problem, problem)
     if experiment.capture:  # then the problem is one of more than a system
@@ -159,7 +185,7 @@ def session_of_animation(
     Raises:
         ValueError: a file cannot be read, or the system does not fit the clip.
     """
-    loaded = load_animation(files)
+    loaded, requested = load_animation(files), preset
     preset = preset or systems.choose_preset([loaded.clip])
     names = {DEFAULT: preset.system(loaded.clip.rig)} | ({GIVEN: start} if start else {})
     starts = {name: with_floats(ik, np.float64) for name, ik in reversed(names.items())}
@@ -167,7 +193,7 @@ def session_of_animation(
         starts = {name: systems.without_own_root(ik) for name, ik in starts.items()}
     first = next(iter(starts.values()))
     loaded.check_shapes(first)
-    captured, cost = loaded.captured, None
+    captured, cost, data = loaded.captured, None, None
     if captured is not None:
         captured = with_soles_of(captured, loaded.clip)
         if files.floor == 0.0:  # a scene knows no other
@@ -175,7 +201,10 @@ def session_of_animation(
             cost = partial(cost_of_scenes, (problems.make_scene(data, {}),))
     prepared = replace(loaded, given_frames=loaded.frames, captured=captured)
     title = f"{files.clip.name} on {files.terrain.name}"
-    return Session(title, (SessionClip(files.clip.name, prepared),), starts, preset, cost=cost)
+    own = (ClipFile(files.clip, files.clip_options.of_file(files.clip)),)
+    clip = SessionClip(files.clip.name, prepared, data=data, files=own)
+    again = partial(session_of_animation, replace(files), requested, start)
+    return Session(title, (clip,), starts, preset, cost=cost, reload=again)
 
 
 def with_start(session: Session, name: str, ik: jaxik.FootIK) -> Session:

@@ -113,17 +113,11 @@ class Solver:
             motions["captured"] = ViewedMotion("captured", captured, motion_data.CAPTURED, True)
         return ViewedClip(
             motions,
-            self.labelled.stance_labels(),
+            self.clip.labelled.stance_labels(),
             own.own_speed,
             ground_path.around_path(own.placed_clip, own.terrain),
             watched=SOLVED,
         )
-
-    @property
-    def labelled(self) -> Clip:
-        """The motion whose stances the page shows."""
-        own = self.animation
-        return own.clip if own.captured is None else own.captured
 
     @cached_property
     def _flat(self) -> PlacedMotion:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -16,17 +17,17 @@ from fitting.studies.fit import fit_report, run_folder
 from fitting.studies.fit.fit import Fit
 from fitting.studies.fit.fit_report import Measured
 
-from .experiments import CLIP, write
+from .experiments import CLIP, ROOT, write
 from .profiles import parabolas
 
 LIMITS = {"leg.max_knee_angle": 0.5, "pelvis.limit": 0.0}  # fractions of the frames
 NAMES = ("pelvis.on_gain", "foot.max_pitch")
 
 
-def invented_fit(folder: Path, more: str = "") -> Fit:
+def invented_fit(folder: Path, more: str = "", clips: str = CLIP) -> Fit:
     """A fit with invented numbers; its experiment, with more tables, is written to the folder."""
     rest = f"[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false\n{more}"
-    path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.5")
+    path = write(folder, rest=rest, clips=clips, clip="start = 1.0\nend = 1.5")
     experiment = experiment_files.load_experiment(path)
     problem = problems.make_problem(experiment)
     u = np.array([0.3, -0.2])
@@ -58,6 +59,14 @@ def invented_fit(folder: Path, more: str = "") -> Fit:
         improvement=0.0,
     )
     return Fit(experiment, problem, solution, identifiability)
+
+
+def with_own_files(folder: Path) -> Fit:
+    """The fit with its clips, of which the folder has copies, beside which files may be written."""
+    for name in ("uneven_walk.npz", "uneven_walk_base.npz"):
+        shutil.copy(ROOT / "data" / "clips" / name, folder)
+    clips = CLIP.replace(f"{ROOT}/data/clips", f"{folder}")
+    return with_clips(invented_fit(folder, clips=clips))
 
 
 def with_clips(fitted: Fit) -> Fit:

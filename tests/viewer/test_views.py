@@ -7,13 +7,15 @@ import json
 import zlib
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fitting import viewer
-from fitting.clips import save_clip
-from fitting.experiment import parameter_files
+from fitting.clips import load_clip, save_clip
+from fitting.experiment import parameter_files, problems
+from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import LoadedExperiment
 from fitting.experiment.systems import Preset
 from fitting.inference.optimise.solution import Progress, Report
@@ -312,3 +314,56 @@ def test_a_port_in_use_is_passed_over_and_an_address_elsewhere_refused(served):
         with pytest.raises(ValueError, match=words):
             Server(served.viewer, address)
     assert Address("::1").is_local and not Address("0.0.0.0").is_local
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory) -> Iterator[tuple[Server, Path]]:
+    """A server of half a second of a walk, and the folder with the files of its clips."""
+    folder = tmp_path_factory.mktemp("labelled")
+    runs.save(folder, runs.with_own_files(folder))
+    with views.opened(viewer.session_of_run(folder), folder, Address(port=0)) as server:
+        yield server, folder
+
+
+def test_stances_put_right_on_the_page_are_read_wherever_the_clip_is(labelled):
+    server, folder = labelled
+    names = "uneven_walk.npz", "uneven_walk_base.npz"
+    before = [load_clip(folder / name) for name in names]
+    status, content = ask(server, "/clip/0")
+    legs = json.loads(content)["contacts"]["legs"]
+    number, (stance, *_) = next((number, leg) for number, leg in enumerate(legs) if leg)
+    legs[number] = [stance | {"start": 0.3, "end": 0.4, "byHand": True, "leftOut": True}]
+    status, answer = ask(server, "/contacts", {"clip": 0, "legs": legs})
+    answer = json.loads(answer)
+    assert status == 200 and "uneven_walk_base.contacts.toml: " in answer["message"]
+    (shown,) = answer["clip"]["contacts"]["legs"][number]
+    assert shown["byHand"] and shown["leftOut"] and shown["start"] == pytest.approx(0.3)
+    (data,) = problems.load_clips(load_experiment(folder / "experiment.toml"))
+    part = slice(30, 46)
+    for name, clip, read in zip(names, before, (data.reference, data.base), strict=True):
+        after = load_clip(folder / name)
+        changed = np.any(after.stance != clip.stance_labels(), axis=1)
+        assert changed[part].any() and not changed[:30].any() and not changed[46:].any()
+        np.testing.assert_array_equal(read.stance, after.stance[part])
+    assert data.reference.left_out.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"start": 9.0, "end": 9.5}, "is not within the clip"),
+        ({"start": 0.4, "end": 0.1}, "ends before it starts"),
+        ({"start": None}, "a stance without"),
+        ({"byHand": False, "probability": 3}, "probability"),
+    ],
+)
+def test_stances_that_are_none_are_refused_and_nothing_is_written(labelled, change, words):
+    server, folder = labelled
+    files = {path: path.read_bytes() for path in folder.glob("*.contacts.toml")}
+    legs = json.loads(ask(server, "/clip/0")[1])["contacts"]["legs"]
+    leg = next(leg for leg in legs if leg)
+    leg[0] |= {"byHand": True} | change
+    status, answer = ask(server, "/contacts", {"clip": 0, "legs": legs})
+    assert status == 400 and words in answer.decode()
+    assert ask(server, "/contacts", {"clip": 0, "legs": legs[:1]})[0] == 400
+    assert files == {path: path.read_bytes() for path in folder.glob("*.contacts.toml")}
