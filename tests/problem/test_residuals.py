@@ -16,7 +16,8 @@ import jaxik
 from fitting.experiment import experiment_files, problems
 from fitting.experiment.problems import load_known_values
 from fitting.problem import residuals
-from fitting.problem.problem import Problem
+from fitting.problem.problem import Problem, digest
+from fitting.problem.scene import PER_LEG
 from fitting.problem.simulation import autoregression, simulate
 from fitting.runtime.program_cache import committed
 from jaxik.maths import parameter_tree
@@ -163,6 +164,38 @@ def test_frames_unobserved_kinds_switched_off_and_legs_absent_have_no_residuals(
     for kind in ("ankle", "knee", "foot", "contact", "smooth"):
         first, second = np.split(absent[kind], 2, axis=1)
         assert first.any() and not second.any(), kind
+
+
+def test_a_leg_that_is_left_out_has_no_residuals_and_affects_no_other(problem, start):
+    """Where it comes back, its residuals are as in a first frame."""
+    (scene,) = problem.data
+    out = np.zeros((len(scene.frames.dt), 2), bool)
+    out[20:30, 0] = True
+    left_out = changed(problem, reference={"left_out": jnp.asarray(out)})
+    (without,) = left_out.data
+    unknown = jnp.where(out[..., None], jnp.nan, scene.reference.knee_ws)
+    reference = dataclasses.replace(without.reference, knee_ws=unknown)
+    without = dataclasses.replace(without, reference=reference)
+    whole, part = (
+        residuals.residuals_by_kind(each, residuals.errors_by_kind(each, start.result))
+        for each in (scene, without)
+    )
+    for kind in whole:
+        before, after = np.array(whole[kind]), np.array(part[kind])
+        if kind in PER_LEG:
+            first = 18 if kind == "smooth" else 20  # of an acceleration, which takes three frames
+            assert before[first:30, 0].any() and not after[first:30, 0].any()
+            if kind == "smooth":
+                before[first:30, 0] = 0.0
+            else:
+                error = residuals.errors_by_kind(scene, start.result)[kind][30, 0]
+                np.testing.assert_array_equal(after[30, 0], error / getattr(scene.sigmas, kind))
+                before[first:31, 0] = after[first:31, 0]
+        np.testing.assert_array_equal(after, before, err_msg=kind)
+    counts = np.asarray(without.counts("ankle"))
+    np.testing.assert_array_equal(counts, ~out & np.asarray(scene.reference.observed)[:, None])
+    digests = {digest(each) for each in (problem, left_out)}
+    assert len(digests) == 2, "a fit would go on with what it knows of other data"
 
 
 def test_an_autoregression_is_stationary():

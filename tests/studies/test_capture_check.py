@@ -11,6 +11,7 @@ import trimesh
 
 from fitting.cli import main
 from fitting.clips import Clip, save_clip
+from fitting.clips.stances import stances_of, with_stances
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import ClipData
 from fitting.ground.coverage import relief
@@ -18,6 +19,7 @@ from fitting.ground.meshes import load_terrain
 from fitting.motion.flat_animation import flatten_clip
 from fitting.report import pages
 from fitting.studies.fit import capture_check, run_folder
+from jaxik.world.terrain import Terrain
 from support.experiments import write
 from support.sample_clips import flat_floor, stair_walk
 from support.small_studies import HALF_SECOND
@@ -31,6 +33,10 @@ def floor(tmp_path_factory):
     corners = np.array([[-9.0, 0.0, -9.0], [9.0, 0.0, -9.0], [9.0, 0.0, 9.0], [-9.0, 0.0, 9.0]])
     trimesh.Trimesh(corners, [[0, 2, 1], [0, 3, 2]], process=False).export(path)
     return path
+
+
+def data(clip: Clip, terrain: Terrain) -> ClipData:
+    return ClipData(clip, clip, terrain)
 
 
 def moved(by: Callable[[np.ndarray], np.ndarray], strides: int = 5) -> Clip:
@@ -90,6 +96,44 @@ def test_the_flat_animation_of_a_clip_on_flat_ground_is_the_clip_itself():
     np.testing.assert_allclose(flat.positions_ws[:, walk.rig.pelvis], positions[:, pelvis[0]])
     stairs = flatten_clip(stair_walk(), lambda points: points[:, 1])
     assert np.ptp(stairs.positions_ws[:, walk.rig.pelvis, 1]) < 1e-12
+
+
+def test_footholds_that_do_not_agree_with_the_ground_are_named_unless_they_are_left_out(floor):
+    clip = stair_walk(flat_floor, 5)
+    listed = stances_of(clip)
+    second = listed["left"][1]
+    positions, leg = clip.positions_ws.copy(), clip.rig.names.index("left")
+    raised = slice(round(second.start * clip.fps), round(second.end * clip.fps) + 1)
+    positions[raised, clip.rig.joints[leg], 1] += 0.05  # as if it stood on a box
+    wrong = clip.with_motion(positions, clip.rotations_ws)
+    terrain = load_terrain(floor)
+    feet = capture_check.footholds(data(wrong, terrain))
+    assert [(foot.leg, foot.stance) for foot in feet] == [
+        (leg, stance) for leg in listed for stance in listed[leg]
+    ]
+    (foot,) = [foot for foot in feet if foot.disagrees]
+    assert (foot.leg, foot.stance) == ("left", second)
+    assert foot.gap == pytest.approx(0.05, abs=0.005)
+    named = r"1 of 11 footholds do not agree .*left from 0.9 to 1.4 s is [45]\.\d cm over it"
+    assert any(re.search(named, line) for line in capture_check.check([data(wrong, terrain)]).lines)
+
+    others = [replace(each, left_out=each == second) for each in listed["left"]]
+    without = with_stances(wrong, {**listed, "left": tuple(others)})
+    assert [foot.disagrees for foot in capture_check.footholds(data(without, terrain))].count(True)
+    assert not re.search("footholds", "".join(capture_check.check([data(without, terrain)]).lines))
+
+
+def test_an_offset_that_all_footholds_have_is_no_disagreement_and_missing_ground_is(floor):
+    clip, terrain = stair_walk(flat_floor, 5), load_terrain(floor)
+    by = [[0.0, 0.06, 0.0]]
+    high = clip.with_motion(clip.positions_ws + by, clip.rotations_ws)
+    assert not any(foot.disagrees for foot in capture_check.footholds(data(high, terrain)))
+    aside = clip.with_motion(clip.positions_ws + [[0.0, 0.0, 7.7]], clip.rotations_ws)
+    off = [foot for foot in capture_check.footholds(data(aside, terrain)) if foot.disagrees]
+    assert off and all(np.isnan(foot.gap) for foot in off)
+    assert off[0].text.endswith("s has no ground below it")
+    none = with_stances(clip, {"left": (), "right": ()})
+    assert capture_check.footholds(data(none, terrain)) == ()
 
 
 @pytest.mark.slow
