@@ -121,6 +121,7 @@ def clip_from_recording(
         float(rate), recording.frame_time, source, float(scale), up,
         roles.dialect if roles else None, rig, mask=recording.mask, remarks=tuple(remarks),
         rest_rotations_ls=recording.rest_rotations_ls, channels=recording.channels,
+        model=recording.model,
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts, skating
 from .joint_maps import ADVICE, find_roles
+from .model import Model
 from .rigs import left_directions, rotation
 from .skating import Skating
 
@@ -92,6 +93,8 @@ class Clip:
     """Rest pose, wxyz, relative to the parents; None where no joint is rotated in it."""
     channels: tuple[str, ...] | None = None
     """Of a BVH file, for each joint in the file's order and spelling, with blanks between."""
+    model: Model | None = None
+    """Of a glTF file with a skinned mesh: what else is in it."""
 
     def __post_init__(self) -> None:
         for name in ("offsets_ls", "positions_ws", "rotations_ws", "rest_rotations_ls", *TRACKS):
@@ -303,6 +306,8 @@ class Recording:
     """False where the joints are a guess, as a marker was not seen; None where no frame is."""
     remarks: tuple[str, ...] = ()
     """Sentences for the user about anything missing or odd in the file."""
+    model: Model | None = None
+    """What else is in a glTF file with a skinned mesh; lost where units or axes change."""
 
     def __post_init__(self) -> None:
         if self.up_axis not in (None, "y", "z"):
@@ -312,7 +317,8 @@ class Recording:
         """The same motion with every length multiplied by `factor`."""
         with np.errstate(all="ignore"):  # the loader says which joint is too far away
             offsets_ls, positions_ls = self.offsets_ls * factor, self.positions_ls * factor
-        return replace(self, offsets_ls=offsets_ls, positions_ls=positions_ls)
+        model = self.model if factor == 1.0 else None
+        return replace(self, offsets_ls=offsets_ls, positions_ls=positions_ls, model=model)
 
     def rotated(self, matrix: Float64[np.ndarray, "3 3"]) -> "Recording":
         """The same motion in other axes: vectors v become M v, rotations R become M R M⁻¹.
@@ -332,6 +338,7 @@ class Recording:
             positions_ls=self.positions_ls @ matrix.T,
             rotations_ls=turned(self.rotations_ls),
             rest_rotations_ls=None if rest is None else turned(rest),
+            model=None,
         )
 
 

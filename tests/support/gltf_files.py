@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 COMPONENTS = {"f4": 5126, "i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123}
 Keys = Mapping[tuple[int, str], tuple[Any, Any, str]]
 """Times, s, values and interpolation by node and path."""
@@ -58,6 +58,34 @@ class Gltf:
         uri = "data:application/octet-stream;base64," + base64.b64encode(self.content).decode()
         buffers = [{"byteLength": len(self.content), "uri": uri}]
         return json.dumps({**self.header, "buffers": buffers})
+
+
+def skinned_walker(places: Mapping[int, np.ndarray]) -> Gltf:
+    """`walker` with a mesh: around each of its joints a square of two triangles, 2 cm wide.
+
+    Args:
+        places: from the space of each node at rest to the world, (4, 4).
+    """
+    file = walker()
+    square = 0.01 * np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    joints = file.header["skins"][0]["joints"]
+    vertices = np.concatenate([places[joint][:3, 3] + square for joint in joints])
+    followed = np.zeros((len(vertices), 4))
+    followed[:, 0] = np.repeat(np.arange(len(joints)), len(square))
+    faces = np.array([0, 1, 2, 0, 2, 3]) + len(square) * np.arange(len(joints))[:, None]
+    binds = np.stack([np.linalg.inv(places[joint]).T.ravel() for joint in joints])
+    file.header["skins"][0]["inverseBindMatrices"] = file.add(binds)
+    attributes = {
+        "POSITION": file.add(vertices),
+        "JOINTS_0": file.add(followed, "u1"),
+        "WEIGHTS_0": file.add(np.tile([1.0, 0, 0, 0], (len(vertices), 1))),
+    }
+    primitive = {"attributes": attributes, "indices": file.add(faces.ravel(), "u2"), "material": 0}
+    file.header["materials"] = [{"name": "cloth"}]
+    file.header["meshes"] = [{"primitives": [primitive]}]
+    file.header["nodes"].append({"name": "body", "mesh": 0, "skin": 0})
+    file.header["scenes"][0]["nodes"].append(len(file.header["nodes"]) - 1)
+    return file
 
 
 def walker() -> Gltf:

@@ -1,35 +1,38 @@
 """Reader of glTF 2.0 and GLB files: skinned characters and plain nodes with an animation.
 
 All nodes above the skeleton, with their rotations, scales and motion, are part of it: positions
-are those of the scene, in metres with y up, as the format has it. Meshes, materials and morph
-targets are not read. Every count and place in the header is held against the bytes that are there,
-so that reading takes no more memory than the file has.
+are those of the scene, in metres with y up, as the format has it. Meshes are kept as they are
+(`gltf_model`), and read only to be shown; morph targets are not.
 """
 
-import base64
-import binascii
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from fitting.clips.clip import FASTEST, SLOWEST, Recording, local_from_world
-from fitting.runtime.validation import error_context, why_unreadable
+from fitting.clips.model import Model
+from fitting.runtime.validation import error_context
 
-Item = Mapping[str, Any]
-
-MAGIC = b"glTF"
-JSON, BIN = 0x4E4F534A, 0x004E4942  # kinds of chunks
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-COMPONENT_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-LARGEST_COUNT = 2**53
+from .gltf_document import (
+    BINARY,
+    DATA,
+    Document,
+    Item,
+    as_index,
+    as_item,
+    as_list,
+    buffer_path,
+    check_accessor,
+    check_uncompressed,
+)
+from .gltf_model import keep
 
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 ON_KEY = 1e-5  # s; times that are given with 32 bits are no more exact
@@ -46,146 +49,8 @@ SUFFIXES = (".glb", ".gltf")
 PATHS = tuple(WIDTHS)
 MOST_NUMBERS = 1_000_000  # frames times nodes, and keys, of small files; of others their bytes
 
-BINARY = "glb"
 KINDS = (BINARY, "gltf")
-DATA = "data:"  # begins a uri that holds the bytes itself
 JSON_START = 20  # bytes, in the binary form
-
-
-class Document:
-    """A glTF file. Its methods raise ValueError, without the file's name, for what is not glTF."""
-
-    def __init__(self, path: Path):
-        self.folder = path.parent
-        content = path.read_bytes()
-        self.size = len(content)
-        """Bytes of the file, and of the files beside it that were read."""
-        self.binary: bytes | None = None
-        if path.suffix.lower() == f".{BINARY}":
-            content, self.binary = _chunks(content)
-        try:
-            header = json.loads(content.decode("utf-8-sig"))
-        except RecursionError:
-            raise ValueError("its header is nested too deeply") from None
-        except ValueError as error:
-            raise ValueError(f"its header is not JSON: {error}") from None
-        self.header = as_item(header, "the header")
-        self.items = cache(self._items)
-        """A list of the header by its name, empty where there is none."""
-        self._array = cache(self._read_array)
-        self._buffer = cache(self._read_buffer)
-
-    def _items(self, name: str) -> list[Item]:
-        items = as_list(self.header.get(name, []), name)
-        return [as_item(item, f"{name} {index}") for index, item in enumerate(items)]
-
-    def array(self, index: object) -> Float64[np.ndarray, "count width"]:
-        """The values of an accessor; normalised integers have become fractions."""
-        return self._array(as_index(index, len(self.items("accessors")), "accessors"))
-
-    def _read_array(self, number: int) -> Float64[np.ndarray, "count width"]:
-        accessor, where = self.items("accessors")[number], f"accessor {number}"
-        check_accessor(number, accessor)
-        component, kind = accessor.get("componentType"), accessor.get("type")
-        if component not in tuple(COMPONENTS) or kind not in tuple(COMPONENT_WIDTHS):
-            raise ValueError(
-                f"{where} holds {kind!r} of {component!r}; wanted {list(COMPONENT_WIDTHS)}"
-            )
-        count = as_index(accessor.get("count"), LARGEST_COUNT, f"counts of {where}")
-        view = self._view(accessor["bufferView"])
-        dtype, width = np.dtype(COMPONENTS[component]), COMPONENT_WIDTHS[kind]
-        start = as_index(accessor.get("byteOffset", 0), LARGEST_COUNT, f"offsets of {where}")
-        item = width * dtype.itemsize
-        stride = as_index(view[1] or item, LARGEST_COUNT, f"strides of {where}")
-        if not count or stride < item or start + stride * (count - 1) + item > len(view[0]):
-            raise ValueError(
-                f"{where} has {count} values of {item} bytes in {len(view[0])} bytes; wanted at "
-                "least one, and as many as there are bytes"
-            )
-        shape, strides = (count, width), (stride, dtype.itemsize)
-        raw = np.ndarray(shape, dtype, buffer=view[0], offset=start, strides=strides)
-        with np.errstate(all="ignore"):  # what is not finite is refused below
-            array = raw.astype(np.float64)
-        if accessor.get("normalized") is True and dtype.kind in "iu":
-            array = np.maximum(array / np.iinfo(dtype).max, -1.0)
-        if not np.isfinite(array).all():
-            value = int(np.argmin(np.isfinite(array).all(axis=-1)))
-            raise ValueError(
-                f"value {value} of {where} is {array[value].tolist()}; wanted finite numbers"
-            )
-        return array
-
-    def _view(self, index: object) -> tuple[memoryview, object]:
-        """The bytes of a buffer view, and its stride."""
-        views = self.items("bufferViews")
-        number = as_index(index, len(views), "bufferViews")
-        view, where = views[number], f"bufferView {number}"
-        check_uncompressed(where, as_item(view.get("extensions", {}), where))
-        content = self._buffer(as_index(view.get("buffer"), len(self.items("buffers")), "buffers"))
-        start = as_index(view.get("byteOffset", 0), LARGEST_COUNT, f"offsets of {where}")
-        length = as_index(view.get("byteLength"), LARGEST_COUNT, f"lengths of {where}")
-        if start + length > len(content):
-            raise ValueError(
-                f"{where} ends at byte {start + length} of a buffer of {len(content)} bytes"
-            )
-        return memoryview(content)[start : start + length], view.get("byteStride")
-
-    def _read_buffer(self, number: int) -> bytes:
-        uri = self.items("buffers")[number].get("uri")
-        if uri is None:
-            if self.binary is None or number:
-                raise ValueError(f"buffer {number} has neither a uri nor a binary part")
-            return self.binary
-        if not isinstance(uri, str):
-            raise ValueError(f"the uri of buffer {number} is {uri!r}; wanted a text")
-        if uri.startswith(DATA):
-            head, _, text = uri.partition(",")
-            try:
-                return base64.b64decode(text if head.endswith(";base64") else "?", validate=True)
-            except binascii.Error:
-                raise ValueError(f"the uri of buffer {number} is not base64") from None
-        content = buffer_path(self.folder, number, uri).read_bytes()
-        self.size += len(content)
-        return content
-
-
-def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
-    """The header and the binary part of a GLB; none goes beyond the file."""
-    if content[:4] != MAGIC or content[4:8] != (2).to_bytes(4, "little"):
-        raise ValueError(f"wanted a GLB of version 2, which begins with {MAGIC!r} and 2")
-    parts: dict[int, bytes] = {}
-    start = 12
-    while start + 8 <= len(content):
-        length, kind = (int.from_bytes(content[at : at + 4], "little") for at in (start, start + 4))
-        if start + 8 + length > len(content):
-            raise ValueError(f"a part of {length} bytes begins at byte {start + 8} of "
-                             f"{len(content)}: the file is not whole")  # fmt: skip
-        parts.setdefault(kind, content[start + 8 : start + 8 + length])
-        start += 8 + length
-    if JSON not in parts:
-        raise ValueError("a GLB without a header")
-    return parts[JSON], parts.get(BIN)
-
-
-def as_index(value: object, count: int, what: str) -> int:
-    """The value if it is a whole number from 0 to `count` - 1; else ValueError names it."""
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < count:
-        raise ValueError(f"{str(value)[:40]} among the {what}; wanted a whole number below {count}")
-    return value
-
-
-def as_item(value: object, what: str) -> Item:
-    """The value if it is a JSON object; else ValueError names it."""
-    if not isinstance(value, dict):
-        raise ValueError(f"{what} is {str(value)[:40]!r}; wanted a JSON object")
-    return value
-
-
-def as_list(value: object, what: str) -> list[Any]:
-    """The value if it is a JSON list; else ValueError names it."""
-    if not isinstance(value, list):
-        raise ValueError(f"{what} is {str(value)[:40]!r}; wanted a list")
-    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -470,6 +335,17 @@ def world_transforms(
     return np.stack(positions, axis=1), np.stack(rotations, axis=1)
 
 
+def rest_places(tree: Tree) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    """From the space of each node at rest to the world; of -1, the world itself."""
+    places = {-1: np.eye(4)}
+    for node in tree.order:
+        offset, linear, _ = _local(tree, node, {}, np.zeros(1))
+        local = np.eye(4)
+        local[:3, :3], local[:3, 3] = linear[0], offset[0]
+        places[node] = places[tree.parents[node]] @ local
+    return places
+
+
 def _axes(linear: np.ndarray, turn: Rotation) -> Float64[np.ndarray, "frames 4"]:
     """The rotation of a linear map, wxyz; `turn` where it has no two axes."""
     x, y = _unit(linear[..., 0]), _unit(linear[..., 1])
@@ -542,7 +418,7 @@ def read_gltf(path: Path, animation: str | None = None, fps: float | None = None
     with error_context(path):
         if fps is not None and not SLOWEST <= fps <= FASTEST:
             raise ValueError(f"fps is {fps}; wanted {SLOWEST:g} to {FASTEST:g}")
-        document = Document(path)
+        document = Document.read(path)
         tree = read_tree(document)
         name, chosen = _choose(_animations(document), animation)
         curves = _curves(document, chosen, tree)
@@ -553,14 +429,26 @@ def read_gltf(path: Path, animation: str | None = None, fps: float | None = None
         number_of = {joint: number for number, joint in enumerate(joints)}
         parents = tuple(number_of.get(tree.parents[joint], -1) for joint in joints)
         motion = world_transforms(tree, joints, curves, times)
+        model = _model(document, tree, joints)
         rest = world_transforms(tree, joints, {}, times[:1])
     positions_ls, rotations_ls = local_from_world(parents, *motion)
     offsets_ls, rest_rotations_ls = local_from_world(parents, *rest)
     return Recording(
         tree.names(joints), parents, offsets_ls[0], positions_ls, rotations_ls, frame_time,
         metres_per_unit=1.0, up_axis="y", rest_rotations_ls=rest_rotations_ls[0],
-        remarks=(*remarks, *left_out),
+        remarks=(*remarks, *left_out), model=model,
     )  # fmt: skip
+
+
+def _model(document: Document, tree: Tree, joints: list[int]) -> Model | None:
+    """What hangs on the skeleton, if anything does."""
+    if not any("mesh" in node and "skin" in node for node in tree.nodes):
+        return None
+    with suppress(ValueError):  # the motion is good, and it is what was asked for
+        places = rest_places(tree)
+        named = dict(zip(tree.names(joints), joints, strict=True))
+        return keep(document, named, places, places[tree.parents[joints[0]]])
+    return None
 
 
 def _animations(document: Document) -> dict[str, Item]:
@@ -621,10 +509,6 @@ def _curves(document: Document, animation: Item, tree: Tree) -> Curves:
     return curves
 
 
-class RefusalError(ValueError):
-    """Of a file that is glTF, but not in a way that is read."""
-
-
 def checked(kind: str, content: bytes, folder: Path) -> bytes:
     """The content without its characters, whose meshes hang on skeletons.
 
@@ -669,44 +553,3 @@ def checked(kind: str, content: bytes, folder: Path) -> bytes:
     size = JSON_START + len(text) + len(rest)
     head = content[:8] + size.to_bytes(4, "little") + len(text).to_bytes(4, "little")
     return head + content[16:JSON_START] + text + rest
-
-
-def check_accessor(number: int, accessor: Mapping[str, Any]) -> None:
-    """RefusalError for an accessor whose values are not all in a buffer view."""
-    if "sparse" in accessor:
-        raise RefusalError(
-            f"accessor {number} is sparse, which is not supported; export it in full"
-        )
-    if "bufferView" not in accessor:  # which would stand for any number of zeros
-        raise RefusalError(f"accessor {number} has {accessor.get('count')} values but no bytes")
-
-
-def check_uncompressed(what: str, extensions: Mapping[str, Any]) -> None:
-    """RefusalError for a part of a file that has one of the extensions that compress it."""
-    if compressing := [name for name in extensions if "compression" in name]:
-        raise RefusalError(
-            f"{what} is compressed ({compressing[0]}); export it without compression"
-        )
-
-
-def buffer_path(folder: Path, number: int, uri: str) -> Path:
-    """The file in which a buffer is.
-
-    Args:
-        folder: of the glTF file.
-        number: of the buffer.
-        uri: as the file has it.
-
-    Raises:
-        RefusalError: it is elsewhere than beside the glTF file, or cannot be read.
-    """
-    name = unquote(uri)
-    if not name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise RefusalError(f"buffer {number} is in {uri!r}; wanted a file beside this one")
-    path = folder / name
-    if reason := why_unreadable(path):
-        raise RefusalError(
-            f"buffer {number} is in {uri!r}: {reason}; put that file beside this one, or export "
-            "a .glb, which has all in one file"
-        )
-    return path

@@ -1,18 +1,24 @@
 """Writes clips as GLB: a skeleton with one animation, and if wanted the terrain beside it.
 
-Some programs, Unreal Engine among them, make a skeleton only of a mesh that hangs on it: each bone
-is an octahedron from a joint to its child, as wide as in Blender, and moves with the joint.
+A clip from a glTF file with a skinned mesh keeps all that is in it, but for its animations. Of
+other clips, some programs, Unreal Engine among them, make a skeleton only of a mesh that hangs on
+it: each bone is an octahedron from a joint to its child, as wide as in Blender, and moves with it.
 """
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 
-from fitting.clips.clip import Clip, local_from_world, world_from_local
+from fitting.clips.clip import Clip, continuous, local_from_world, world_from_local
+from fitting.clips.model import Model
 from fitting.clips.rigs import rotation, unit
+
+from .gltf_model import GENERATOR
 
 COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
 MAGIC, VERSION = b"glTF", 2
@@ -38,10 +44,11 @@ FACES = np.array(
 class _Buffer:
     """The binary part of a file, and the accessors of its arrays."""
 
-    def __init__(self) -> None:
-        self.content = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+    def __init__(self, content: bytes = b"", header: dict[str, Any] | None = None) -> None:
+        header = {} if header is None else header
+        self.content = bytearray(content) + b"\0" * (-len(content) % 4)
+        self.views: list[dict[str, Any]] = header.setdefault("bufferViews", [])
+        self.accessors: list[dict[str, Any]] = header.setdefault("accessors", [])
 
     def add(self, array: np.ndarray, kind: str, *, with_range: bool = False) -> int:
         """Appends numbers of 16 bits as they are, others in 32; returns the accessor's index."""
@@ -73,6 +80,8 @@ def glb_bytes(clip: Clip, ground: Triangles | None = None) -> bytes:
         clip: any clip.
         ground: world space; a node of its own beside the skeleton.
     """
+    if clip.model is not None:
+        return _model_bytes(clip, clip.model, ground)
     buffer, joints = _Buffer(), len(clip.parents)
     rest = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
     rest = rest if clip.rest_rotations_ls is None else clip.rest_rotations_ls
@@ -86,7 +95,7 @@ def glb_bytes(clip: Clip, ground: Triangles | None = None) -> bytes:
             nodes[parent].setdefault("children", []).append(joint)
     roots = [joint for joint, parent in enumerate(clip.parents) if parent < 0]
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "jaxik"},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "scene": 0,
         "scenes": [{"nodes": roots}],
         "nodes": nodes,
@@ -113,6 +122,52 @@ def glb_bytes(clip: Clip, ground: Triangles | None = None) -> bytes:
         "buffers": [{"byteLength": len(buffer.content)}],
     }
     return _container(json.dumps(document, separators=(",", ":")).encode(), bytes(buffer.content))
+
+
+def _model_bytes(clip: Clip, model: Model, ground: Triangles | None) -> bytes:
+    """The file from which a clip came with the clip as its only animation."""
+    document = copy.deepcopy(dict(model.header))
+    buffer = _Buffer(model.binary, document)
+    nodes = document["nodes"]
+    document["animations"] = [_animation_of_model(clip, model, nodes, buffer)]
+    if ground is not None:
+        materials, meshes = document.setdefault("materials", []), document.setdefault("meshes", [])
+        mesh, grey = _ground(ground, buffer, len(materials))
+        materials += grey
+        meshes.append(mesh)
+        nodes.append({"name": TERRAIN, "mesh": len(meshes) - 1})
+        document["scenes"][document.get("scene", 0)].setdefault("nodes", []).append(len(nodes) - 1)
+    document["buffers"] = [{"byteLength": len(buffer.content)}]
+    return _container(json.dumps(document, separators=(",", ":")).encode(), bytes(buffer.content))
+
+
+def _animation_of_model(
+    clip: Clip, model: Model, nodes: list[dict[str, Any]], buffer: _Buffer
+) -> dict[str, Any]:
+    """The clip in the nodes of the file: each joint below its parent, with the scales there."""
+    above_scale = float(np.cbrt(np.linalg.det(model.above[:3, :3])))
+    above = Rotation.from_matrix(model.above[:3, :3] / above_scale)
+    tracks = _Tracks(clip, buffer)
+    for joint, (name, parent) in enumerate(zip(clip.joint_names, clip.parents, strict=True)):
+        if name not in model.nodes:  # a ball of the foot that the file lacks
+            continue
+        node, turn = nodes[model.nodes[name]], rotation(clip.rotations_ws[:, joint])
+        if parent < 0:
+            origin, parent_turn, scale = model.above[:3, 3], above, above_scale
+        else:
+            origin, scale = clip.positions_ws[:, parent], model.scales[clip.joint_names[parent]]
+            parent_turn = rotation(clip.rotations_ws[:, parent])
+        offset = parent_turn.inv().apply(clip.positions_ws[:, joint] - origin) / scale
+        local = (parent_turn.inv() * turn).as_quat(scalar_first=True)
+        if "matrix" in node:  # which excludes an animation
+            del node["matrix"]
+            node["scale"] = [model.scales[name] / scale] * 3
+            node |= {"translation": offset[0].tolist(), "rotation": _xyzw(local[0]).tolist()}
+        rest = np.array(node.get("translation", [0.0, 0.0, 0.0]))
+        if np.abs(offset - rest).max() * scale > STILL:
+            tracks.add(model.nodes[name], "translation", offset, "VEC3")
+        tracks.add(model.nodes[name], "rotation", _xyzw(continuous(local)), "VEC4")
+    return tracks.animation
 
 
 def _container(text: bytes, content: bytes) -> bytes:
@@ -169,33 +224,45 @@ def _animation(clip: Clip, buffer: _Buffer) -> dict[str, Any]:
     positions_ls, rotations_ls = local_from_world(
         clip.parents, clip.positions_ws, clip.rotations_ws
     )
-    time = buffer.add(np.arange(clip.frame_count) / clip.fps, "SCALAR", with_range=True)
-    samplers: list[dict[str, Any]] = []
-    channels: list[dict[str, Any]] = []
-
-    def add(joint: int, path: str, values: np.ndarray, kind: str) -> None:
-        channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
-        samplers.append({"input": time, "output": buffer.add(values, kind)})
-
+    tracks = _Tracks(clip, buffer)
     for joint in range(len(clip.parents)):
         moves = np.abs(positions_ls[:, joint] - clip.offsets_ls[joint]).max() > STILL
         if moves:
-            add(joint, "translation", positions_ls[:, joint], "VEC3")
-        add(joint, "rotation", _xyzw(rotations_ls[:, joint]), "VEC4")
-    return {"name": Path(clip.source).stem or "motion", "samplers": samplers, "channels": channels}
+            tracks.add(joint, "translation", positions_ls[:, joint], "VEC3")
+        tracks.add(joint, "rotation", _xyzw(rotations_ls[:, joint]), "VEC4")
+    return tracks.animation
 
 
-def _ground(ground: Triangles, buffer: _Buffer) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A mesh, and the materials: its own is grey, and is seen from both sides."""
+class _Tracks:
+    """An animation under construction, with a key in each frame of a clip."""
+
+    def __init__(self, clip: Clip, buffer: _Buffer) -> None:
+        self.buffer = buffer
+        self.time = buffer.add(np.arange(clip.frame_count) / clip.fps, "SCALAR", with_range=True)
+        name = Path(clip.source).stem or "motion"
+        self.animation: dict[str, Any] = {"name": name, "samplers": [], "channels": []}
+
+    def add(self, node: int, path: str, values: np.ndarray, kind: str) -> None:
+        """A property of a node, one value for each frame."""
+        samplers = self.animation["samplers"]
+        target = {"node": node, "path": path}
+        self.animation["channels"].append({"sampler": len(samplers), "target": target})
+        samplers.append({"input": self.time, "output": self.buffer.add(values, kind)})
+
+
+def _ground(
+    ground: Triangles, buffer: _Buffer, material: int = 0
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A mesh, and its materials, the first of which has this number: grey, seen from both sides."""
     vertices, faces = ground
     primitive = {
         "attributes": {"POSITION": buffer.add(vertices, "VEC3", with_range=True)},
         "indices": buffer.add(faces.reshape(-1), "SCALAR"),
-        "material": 0,
+        "material": material,
     }
     surface = {"baseColorFactor": GREY, "metallicFactor": 0.0}
-    material = {"name": TERRAIN, "doubleSided": True, "pbrMetallicRoughness": surface}
-    return {"name": TERRAIN, "primitives": [primitive]}, [material]
+    grey = {"name": TERRAIN, "doubleSided": True, "pbrMetallicRoughness": surface}
+    return {"name": TERRAIN, "primitives": [primitive]}, [grey]
 
 
 def bone_mesh(

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 import jax
 import numpy as np
@@ -273,6 +273,7 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
     sizes = check_arrays(path, content, wanted)
     _check_tree(path, content, sizes["joints"])
     rest = content.get("rest_rotations_ls")
+    tracks: Any = {name: content[name] for name in TRACK_ARRAYS if name in content}
     return Clip(
         joint_names=tuple(map(str, content["joint_names"])),
         parents=tuple(map(int, content["parents"])),
@@ -284,7 +285,7 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         up_axis=str(content["up_axis"]),
         dialect=str(content["dialect"]) if "dialect" in content else None,
         measured_rig=_read_rig(content) if "rig_names" in content else None,
-        **{name: content[name] for name in TRACK_ARRAYS if name in content},
+        **tracks,
         remarks=tuple(map(str, content["remarks"])),
         rest_rotations_ls=rest.astype(np.float64) if rest is not None else None,
         channels=tuple(map(str, content["channels"])) if "channels" in content else None,

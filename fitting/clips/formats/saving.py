@@ -34,7 +34,8 @@ def save_clip(
     From an NPZ, `load_clip` restores the clip exactly. A BVH has the hierarchy, channels, unit,
     axes and frame time of the BVH that the clip came from; of other clips it is in centimetres
     with y up. If a joint needs more channels than it had, a warning says so. A GLB (glTF 2.0) holds
-    a skeleton with one animation, in metres with y up. A CSV has a row for each frame.
+    a skeleton with one animation, in metres with y up; of a clip from a glTF file with a skinned
+    mesh, it is that file with another animation. A CSV has a row for each frame.
 
     Args:
         path: file name; its suffix selects the format.
