@@ -15,13 +15,15 @@ import numpy as np
 from jaxtyping import Bool
 
 from fitting.clips import Clip
+from fitting.clips.model import Model
 from fitting.ground.ground_path import GroundPatch
 from fitting.motion import measures
 from fitting.motion.measures import PlacedMotion
 from jaxik.world import body
 
-from . import bodies, live_data, style
+from . import bodies, live_data, skin_data, style
 from .live_data import LiveClip
+from .skin_data import Skin
 
 MAX_RATE = 60.0  # frames per second that are shown
 MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 adds a third
@@ -93,9 +95,19 @@ def pack(clips: Sequence[ViewedClip], spent: int = 0) -> list[dict[str, Any]]:
     grounds = coarse_grounds([clip.ground for clip in clips])
     corners = [_corner(*pair) for pair in zip(clips, grounds, strict=True)]
     lives, spent_on_lives = live_data.pack([clip.live for clip in clips], corners)
+    skins = [_skins(clip) for clip in clips]
+    spent += sum(skin.size for each in skins for skin in each.values())
     room = MAX_BYTES - spent - spent_on_lives - sum(map(_ground_bytes, grounds))
     steps = steps_between_frames(clips, room)
-    return [_pack_clip(*each) for each in zip(clips, grounds, corners, lives, steps, strict=True)]
+    packed = zip(clips, grounds, corners, lives, steps, skins, strict=True)
+    return [_pack_clip(*each) for each in packed]
+
+
+def _skins(clip: ViewedClip) -> dict[Model, Skin]:
+    """The meshes of the characters of a clip's motions."""
+    clips = {each.motion.clip.model: each.motion.clip for each in clip.motions.values()}
+    skins = {model: skin_data.pack(of) for model, of in clips.items() if model is not None}
+    return {model: skin for model, skin in skins.items() if skin is not None}
 
 
 def steps_between_frames(clips: Sequence[ViewedClip], room: int = MAX_BYTES) -> list[int]:
@@ -127,7 +139,8 @@ def _ground_bytes(ground: GroundPatch) -> int:
 
 def _motion_bytes(motion: PlacedMotion) -> int:
     frames, legs = motion.in_ground.shape
-    return 2 * _points(motion).size + frames * (12 + 2 * legs)
+    turns = 0 if motion.clip.model is None else 8 * len(motion.clip.parents)
+    return 2 * _points(motion).size + frames * (12 + 2 * legs + turns)
 
 
 def _corner(clip: ViewedClip, ground: GroundPatch) -> np.ndarray:
@@ -141,7 +154,13 @@ def _pack_clip(
     corner: np.ndarray,
     live: dict[str, Any] | None,
     step: int,
+    skins: Mapping[Model, Skin],
 ) -> dict[str, Any]:
+    firsts: dict[Model, str] = {}  # the first motion that has a mesh brings it
+    for key, viewed in clip.motions.items():
+        model = viewed.motion.clip.model
+        if model is not None and model in skins:
+            firsts.setdefault(model, key)
     reference = clip.reference.clip
     return {
         "rate": reference.fps / step,
@@ -160,6 +179,7 @@ def _pack_clip(
                 "key": key,
                 **_pack_appearance(viewed, step),
                 **_pack_motion(viewed.motion, step, corner),
+                **_pack_skin(viewed.motion.clip, step, skins, firsts, key),
             }
             for key, viewed in clip.motions.items()
         ],
@@ -197,6 +217,18 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
         "offsets": _base64(np.round(offsets / quantum).astype("<i2")),
         "gap": _base64(_rounded(_lowest_gaps(motion, step))),
     }
+
+
+def _pack_skin(
+    clip: Clip, step: int, skins: Mapping[Model, Skin], firsts: Mapping[Model, str], key: str
+) -> dict[str, Any]:
+    """The mesh of a motion's character, or which motion brings it, and its joints' rotations."""
+    if clip.model is None or clip.model not in skins:
+        return {}
+    skin, first = skins[clip.model], firsts[clip.model]
+    rotations_ws = clip.rotations_ws[::step][:, list(skin.joints)]
+    turns = {"skinned": first, "turns": skin_data.pack_rotations(rotations_ws)}
+    return turns | ({"skin": skin.content} if key == first else {})
 
 
 def _points(motion: PlacedMotion) -> np.ndarray:

@@ -26,6 +26,7 @@ SCRIPTS = ("theme.js",)
 VIEWER_SCRIPTS = (  # in the order in which they use each other
     "matrices.js",
     "skeletons.js",
+    "skins.js",
     "bodies.js",
     "shaders.js",
     "stage.js",

@@ -101,24 +101,57 @@ void main() {
   gl_Position = view * vec4(place, 1.0);
 }`;
 
+// The mesh of a character: each vertex follows four slots, whose matrices are rows of a texture.
+const SKIN_VERTICES = `#version 300 es
+in vec3 position, normal;
+in vec4 followed, weights;
+uniform mat4 view;
+uniform highp sampler2D slots;
+uniform vec4 tint;
+uniform float swelling; // m, along the normal
+out vec3 outward;
+out vec3 place;
+out vec4 paint;
+out float red;
+void main() {
+  place = outward = vec3(0.0);
+  red = 0.0;
+  for (int i = 0; i < 4; i++) {
+    int slot = int(followed[i]);
+    vec4 x = texelFetch(slots, ivec2(0, slot), 0), y = texelFetch(slots, ivec2(1, slot), 0);
+    vec4 z = texelFetch(slots, ivec2(2, slot), 0);
+    vec4 at = vec4(position, 1.0);
+    place += weights[i] * vec3(dot(x, at), dot(y, at), dot(z, at));
+    outward += weights[i] * vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal));
+    red += weights[i] * texelFetch(slots, ivec2(3, slot), 0).x;
+  }
+  outward = length(outward) > 0.0 ? normalize(outward) : vec3(0.0, 1.0, 0.0);
+  place += swelling * outward;
+  paint = tint;
+  gl_Position = view * vec4(place, 1.0);
+}`;
+
 const BODY_COLOURS = `#version 300 es
 precision highp float;
 in vec3 outward;
 in vec3 place;
 in vec4 paint; // the less opaque, the more only its rim is seen, like glass
 in float red;
-uniform vec3 light, eye;
+uniform vec3 light, eye, sunk;
 uniform float strength; // below 1 of what is hidden, where red is seen better
+uniform bool isSkin; // whose feet are coloured here
 out vec4 colour;
 void main() {
+  vec3 base = isSkin ? mix(paint.rgb, sunk, red) : paint.rgb;
+  float solid = isSkin ? mix(paint.a, 1.0, red) : paint.a;
   vec3 normal = normalize(outward);
   vec3 toEye = normalize(eye - place);
   float facing = abs(dot(normal, toEye));
   float lit = 0.5 + 0.5 * dot(normal, light);
   float shade = 0.5 + 0.58 * lit * lit + 0.1 * facing;
   float shine = 0.12 * pow(max(dot(reflect(-light, normal), toEye), 0.0), 16.0);
-  float opacity = mix(0.06 + 0.94 * pow(1.0 - facing, 1.5), 1.0, paint.a);
-  colour = vec4(min(paint.rgb * shade + shine, 1.0), 1.0) * opacity * mix(strength, 1.0, 0.45 * red);
+  float opacity = mix(0.06 + 0.94 * pow(1.0 - facing, 1.5), 1.0, solid);
+  colour = vec4(min(base * shade + shine, 1.0), 1.0) * opacity * mix(strength, 1.0, 0.45 * red);
 }`;
 
 // A capsule: rings of directions around both ends, and rings between. Corners are of 7 numbers.

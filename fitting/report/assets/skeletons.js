@@ -7,6 +7,8 @@ function bytesOf(base64) {
   return Uint8Array.from(atob(base64), (character) => character.charCodeAt(0)).buffer;
 }
 
+const skins = new Map(); // by the key of the skeleton that brings one
+
 class Skeleton {
   // `visibleDepth`: m, from which on a sole is marked as in the ground.
   constructor(packed, legs, visibleDepth) {
@@ -15,11 +17,15 @@ class Skeleton {
     this.offsets = new Int16Array(bytesOf(packed.offsets));
     this.packedGap = Float32Array.from(new Int16Array(bytesOf(packed.gap)), (step) => (step === NO_GAP ? NaN : 1e-4 * step));
     this.show(null);
+    if (packed.skin) skins.set(packed.skinned, new Skin(packed.skin));
+    this.skin = skins.get(packed.skinned) ?? null;
+    if (this.skin) this.turns = new Int16Array(bytesOf(packed.turns));
     this.legCount = legs;
     this.positions = new Float32Array(3 * packed.points);
   }
 
   // Another motion of this skeleton, `points` in each frame and the `gap` below each sole; null is its own.
+  // With a skin it may have `turns` as the skeleton has them.
   show(solution) {
     this.solution = solution;
     this.gap = solution ? solution.gap : this.packedGap;
@@ -27,9 +33,18 @@ class Skeleton {
 
   // A coordinate of a point in a frame, m; `i` is the point's number times 3, plus that of the axis.
   at(frame, i) {
-    const place = 3 * this.points * frame + i;
-    if (this.solution) return this.solution.points[place];
-    return this.root[3 * frame + (i % 3)] + this.quantum * this.offsets[place];
+    if (this.solution) return this.solution.points[3 * this.points * frame + i];
+    return this.packed(frame, i);
+  }
+
+  packed(frame, i) {
+    return this.root[3 * frame + (i % 3)] + this.quantum * this.offsets[3 * this.points * frame + i];
+  }
+
+  // A point of its own motion, whatever is shown, in the frame before a time.
+  packedPoint(index, time) {
+    const frame = Math.min(Math.floor(time), this.root.length / 3 - 1);
+    return [0, 1, 2].map((axis) => this.packed(frame, 3 * index + axis));
   }
 
   // All points at a time in frames, linear between two, in `positions`; m.

@@ -1,6 +1,7 @@
 // Draws ground and bodies with WebGL 2.
 
 const HIDDEN = 0.22; // strength of what is behind or in the ground
+const SWELLING = 0.06; // m, of an adult's mesh that is twice as thick
 const LAYOUT = [["start", 3], ["end", 3], ["tint", 4], ["radii", 3], ["across", 3], ["more", 2]]; // of instances
 
 class Stage {
@@ -13,7 +14,10 @@ class Stage {
     this.bodyProgram = this.program(BODY_VERTICES, BODY_COLOURS);
     this.limbs = this.bodyBuffers(capsule());
     this.slabs = this.bodyBuffers(slab());
+    this.skinProgram = this.program(SKIN_VERTICES, BODY_COLOURS);
     this.shadowTexture = this.texture();
+    this.slotTexture = this.texture();
+    this.skinBuffers = new Map();
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
@@ -88,6 +92,11 @@ class Stage {
     this.ground = ground;
     gl.deleteVertexArray(this.groundVertices ?? null);
     for (const buffer of this.groundBuffers ?? []) gl.deleteBuffer(buffer);
+    for (const { vertices, buffers } of this.skinBuffers.values()) {
+      gl.deleteVertexArray(vertices);
+      for (const buffer of buffers) gl.deleteBuffer(buffer);
+    }
+    this.skinBuffers.clear(); // another clip may have other characters
     this.groundBuffers = [];
     this.groundVertices = gl.createVertexArray();
     gl.bindVertexArray(this.groundVertices);
@@ -121,11 +130,14 @@ class Stage {
     const figures = skeletons.map((skeleton) => figure(skeleton, time, palette, this.ground.size));
     this.drawGround(skeletons.at(-1), figures.at(-1), view, camera, palette);
     const opaqueFirst = figures.map((_, i) => i).sort((a, b) => skeletons[b].opacity - skeletons[a].opacity);
-    for (const i of opaqueFirst) this.drawBody(figures[i], view, camera);
+    for (const i of opaqueFirst) {
+      if (skeletons[i].skin) this.drawSkin(skeletons[i], time, view, camera, palette);
+      else this.drawFigure(figures[i], view, camera);
+    }
     if (segments?.length) {
       const capsules = new Instances();
       capsules.addSegments(segments);
-      this.drawBody(capsules, view, camera);
+      this.drawFigure(capsules, view, camera);
     }
   }
 
@@ -168,25 +180,63 @@ class Stage {
     gl.uniform3f(uniform("middle"), x, z, reach + softness);
   }
 
-  drawBody(figure, view, camera) {
-    const gl = this.gl, { program, uniform } = this.bodyProgram;
-    gl.useProgram(program);
-    gl.uniformMatrix4fv(uniform("view"), false, view);
-    gl.uniform3fv(uniform("light"), LIGHT);
-    gl.uniform3fv(uniform("eye"), camera.eye);
+  drawFigure(figure, view, camera) {
+    const gl = this.gl, program = this.bodyProgram;
     const kinds = [[this.limbs, figure.limbs, 0], [this.slabs, figure.slabs, 1]];
     for (const [buffers, numbers] of kinds) {
       gl.bindBuffer(gl.ARRAY_BUFFER, buffers.instances);
       gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(numbers), gl.DYNAMIC_DRAW);
     }
-    const drawAll = () => {
+    this.drawBody(program, view, camera, () => {
       for (const [{ vertices, count }, numbers, isSlab] of kinds) {
         if (!numbers.length) continue;
-        gl.uniform1i(uniform("isSlab"), isSlab);
+        gl.uniform1i(program.uniform("isSlab"), isSlab);
         gl.bindVertexArray(vertices);
         gl.drawElementsInstanced(gl.TRIANGLES, count, gl.UNSIGNED_SHORT, 0, numbers.length / FIELDS);
       }
-    };
+    });
+  }
+
+  // The mesh of a skeleton that has one.
+  drawSkin(skeleton, time, view, camera, palette) {
+    const gl = this.gl, program = this.skinProgram, { uniform } = program, { skin } = skeleton;
+    if (!this.skinBuffers.has(skin)) this.skinBuffers.set(skin, this.makeSkinBuffers(skin));
+    const texels = skin.texels(skeleton, time);
+    gl.bindTexture(gl.TEXTURE_2D, this.slotTexture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 4, texels.length / 16, 0, gl.RGBA, gl.FLOAT, texels);
+    gl.useProgram(program.program);
+    gl.uniform1i(uniform("slots"), 0);
+    gl.uniform1i(uniform("isSkin"), 1);
+    gl.uniform3fv(uniform("sunk"), palette.sunk);
+    gl.uniform4fv(uniform("tint"), [...palette[skeleton.key], skeleton.opacity]);
+    gl.uniform1f(uniform("swelling"), SWELLING * (skeleton.thickness - 1) * this.ground.size);
+    const wide = skin.triangles instanceof Uint16Array ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT;
+    this.drawBody(program, view, camera, () => {
+      gl.bindVertexArray(this.skinBuffers.get(skin).vertices);
+      gl.drawElements(gl.TRIANGLES, skin.triangles.length, wide, 0);
+    });
+  }
+
+  makeSkinBuffers(skin) {
+    const gl = this.gl, vertices = gl.createVertexArray();
+    const stride = SKIN_FIELDS.reduce((sum, [, size]) => sum + size, 0);
+    gl.bindVertexArray(vertices);
+    const buffers = [this.buffer(skin.vertices)];
+    let offset = 0;
+    for (const [name, size] of SKIN_FIELDS) {
+      this.attribute(this.skinProgram, name, size, stride, offset);
+      offset += size;
+    }
+    buffers.push(this.buffer(skin.triangles, gl.ELEMENT_ARRAY_BUFFER));
+    return { vertices, buffers };
+  }
+
+  drawBody({ program, uniform }, view, camera, drawAll) {
+    const gl = this.gl;
+    gl.useProgram(program);
+    gl.uniformMatrix4fv(uniform("view"), false, view);
+    gl.uniform3fv(uniform("light"), LIGHT);
+    gl.uniform3fv(uniform("eye"), camera.eye);
     gl.enable(gl.BLEND);
     gl.enable(gl.CULL_FACE);
     gl.uniform1f(uniform("strength"), HIDDEN); // first what the ground hides
