@@ -267,16 +267,23 @@ def _travel(pelvis: np.ndarray) -> list[float]:
     return [0.0, 1.0] if distance < 0.2 else (furthest / distance).tolist()
 
 
-def solution(motion: PlacedMotion, corner: np.ndarray, step: int) -> dict[str, np.ndarray]:
+def solution(motion: PlacedMotion, shown: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Another motion of a clip as its page shows one that it has solved: points and gaps, m.
+
+    Where the character has a mesh, rotations of its joints are there, too.
 
     Args:
         motion: over all frames.
-        corner: to which places on the page are relative, m.
-        step: how many frames make one on the page.
+        shown: the clip as the page has it.
     """
-    points = (_points(motion)[::step] - corner).astype("<f4")
-    return {"points": points, "gap": _lowest_gaps(motion, step).astype("<f4")}
+    step = shown["step"]
+    points = (_points(motion)[::step] - np.array(shown["corner"])).astype("<f4")
+    arrays = {"points": points, "gap": _lowest_gaps(motion, step).astype("<f4")}
+    for skeleton in shown["skeletons"]:
+        if "skin" in skeleton:
+            rotations_ws = motion.clip.rotations_ws[::step][:, skeleton["skin"]["joints"]]
+            arrays["turns"] = skin_data.rounded_rotations(rotations_ws)
+    return arrays
 
 
 def _lowest_gaps(motion: PlacedMotion, step: int) -> np.ndarray:

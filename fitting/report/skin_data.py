@@ -56,8 +56,13 @@ def pack(clip: Clip) -> Skin | None:
 
 
 def pack_rotations(rotations_ws: Float64[np.ndarray, "frames joints 4"]) -> str:
-    """Quaternions of a skin's joints, wxyz."""
-    return _base64(np.round(rotations_ws * LARGEST).astype("<i2"))
+    """Quaternions of a skin's joints, wxyz, in base64."""
+    return _base64(rounded_rotations(rotations_ws))
+
+
+def rounded_rotations(rotations_ws: Float64[np.ndarray, "frames joints 4"]) -> np.ndarray:
+    """Quaternions of a skin's joints, wxyz, as integers of 16 bits."""
+    return np.round(rotations_ws * LARGEST).astype("<i2")
 
 
 def _weights(surface: Surface) -> np.ndarray:

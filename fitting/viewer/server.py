@@ -26,10 +26,10 @@ import jaxik
 from fitting.report import live_data, motion_data, pages
 from fitting.runtime.validation import Content
 
-from . import contact_edits, tuning
+from . import edits
+from .edits import Tuning
 from .session import Session
 from .solving import LAYERS, Solved, Solver
-from .tuning import Tuning
 
 MOST_PORTS = 100  # that are tried
 MAX_REQUEST = 10_000_000  # bytes
@@ -106,7 +106,7 @@ class Viewer:
                 content |= {"live": self.tuning.content()}
                 if self.session.reload is not None:
                     clip = solver.clip
-                    content["contacts"] = contact_edits.pack(clip.labelled, clip.data)
+                    content["contacts"] = edits.pack_stances(clip.labelled, clip.data)
                 self._clips[number] = content
             return self._clips[number]
 
@@ -125,7 +125,7 @@ class Viewer:
         with self._lock:
             clip, ik = self.clip(number), self._system(request)
             solved = self._solver(number).solve(ik, [name for name in layers if name in LAYERS])
-        return _packed(solved, np.array(clip["corner"]), clip["step"])
+        return _packed(solved, clip)
 
     def save(self, request: Content) -> list[str]:
         """Writes the system with these values; says what was written.
@@ -136,7 +136,7 @@ class Viewer:
         session, drop = self.session, _field(request, "drop", bool)
         with self._lock:
             ik = self._system(request)
-            return tuning.save(self.folder, ik, session.preset, session.leg_length, drop=drop)
+            return edits.save(self.folder, ik, session.preset, session.leg_length, drop=drop)
 
     def save_contacts(self, request: Content) -> Content:
         """Writes the stances of a clip; the clip as it is read with them, and a message.
@@ -149,7 +149,7 @@ class Viewer:
             clip = self._solver(number).clip
             if self.session.reload is None:
                 raise ValueError("stances cannot be put right while a fit goes on")
-            message = contact_edits.save(clip.files, clip.labelled, legs)
+            message = edits.save_contacts(clip.files, clip.labelled, legs)
             self.session = self.session.reload()
             self.tuning = Tuning(self.session)
             self._solvers, self._clips = {}, {}
@@ -179,9 +179,13 @@ def _field(request: Content, name: str, kind: type) -> Any:
     return value
 
 
-def _packed(solved: Solved, corner: np.ndarray, step: int) -> bytes:
+def _packed(solved: Solved, shown: Content) -> bytes:
     """The length of a JSON text, the text, and after it the arrays that it lists."""
-    arrays = motion_data.solution(solved.motion, corner, step)
+    arrays, step, corner = (
+        motion_data.solution(solved.motion, shown),
+        shown["step"],
+        shown["corner"],
+    )
     for name, (points, colours) in solved.layers.items():
         arrays[f"{name} points"] = (points[::step] - corner).astype("<f4")
         arrays[f"{name} colours"] = colours[::step]

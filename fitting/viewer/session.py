@@ -28,7 +28,7 @@ from fitting.runtime.program_cache import cached
 from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
 
-from .contact_edits import ClipFile
+from .edits import ClipFile
 
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to
 Cost = Callable[[jaxik.FootIK], Float[Array, ""]]
@@ -103,7 +103,7 @@ def session_of_run(run: Path) -> Session:
     experiment, summary = run_folder.load_fit(run)
     clips = problems.load_clips(experiment)
     problem = problems.problem_from_clips(experiment, clips)
-    if experiment.noise.moves_optimum:  # only then it is part of what the fit minimised
+    if experiment.noise.moves_optimum and "noise" in summary:  # else the fit was without it
         problem = with_noise(problem, NoiseModel(**summary["noise"]))
     values = {row["name"]: row["u"] for row in summary["parameters"]}
     u = np.array([values[name] for name in problem.space.names])

@@ -23,12 +23,12 @@ from jaxik.world import body
 from jaxik.world.body import similar
 from jaxik.world.terrain import Hit
 
+from .edits import SOLVED
 from .session import Session
 
 Colour: TypeAlias = tuple[int, int, int]
 """RGB, 0..255."""
 
-SOLVED = "solved"  # key of the motion that sliders change
 FOUND, MISSED = (0, 158, 115), (150, 150, 150)
 FOOTHOLD, LOCK, TARGET = (0, 114, 178), (230, 159, 0), (204, 61, 130)
 WITHIN, BEYOND = (0, 158, 115), (230, 30, 30)

@@ -34,6 +34,8 @@ class Measuring {
     this.stance = new Uint8Array(bytesOf(clip.stance));
     this.flatPath = new Float32Array(bytesOf(clip.flatPath));
     this.rows = new WeakMap(); // by the gaps of a motion
+    this.paths = new WeakMap();
+    for (const skeleton of skeletons) skeleton.measuring = this;
     this.captured = skeletons.find((skeleton) => skeleton.key === "captured") ?? null;
   }
 
@@ -53,6 +55,11 @@ class Measuring {
 
   // How far a standing ball has gone since its stance began, beyond the animated one, m; 0 in a swing.
   slides(skeleton) {
+    if (!this.paths.has(skeleton.gap)) this.paths.set(skeleton.gap, this.measureSlides(skeleton));
+    return this.paths.get(skeleton.gap);
+  }
+
+  measureSlides(skeleton) {
     const { frames, legs } = this.clip, slides = new Float32Array(frames * legs.length);
     legs.forEach((_, leg) => {
       const ball = 3 * skeleton.legs[leg][3];

@@ -273,7 +273,7 @@ class Player {
     const light = (rgb) => (dark ? rgb.map((part) => part + 0.22 * (1 - part)) : rgb);
     this.palette = {
       low: colour("--ground-low"), high: colour("--ground-high"), grid: colour("--grid"),
-      sky: colour("--sky"), sunk: colour("--sunk"),
+      sky: colour("--sky"), sunk: colour("--sunk"), sliding: colour("--sliding"),
     };
     for (const { key, colour: hex } of this.clips.flatMap((clip) => clip?.skeletons ?? [])) {
       this.palette[key] = light(parts(hex));

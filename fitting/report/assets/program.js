@@ -27,7 +27,7 @@ class RemoteSolver {
   read(buffer) {
     const length = new Uint32Array(buffer, 0, 1)[0];
     const { arrays, ...solution } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-    const kinds = { f4: Float32Array, u1: Uint8Array };
+    const kinds = { f4: Float32Array, i2: Int16Array, u1: Uint8Array };
     let offset = 4 + length;
     for (const [name, kind, count] of arrays) {
       const size = count * kinds[kind].BYTES_PER_ELEMENT;

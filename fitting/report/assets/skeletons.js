@@ -74,7 +74,7 @@ class Skeleton {
 
   // Which feet are in the ground in the frame that is shown.
   sunkLegs(time) {
-    const frame = Math.min(Math.round(time), this.root.length / 3 - 1);
+    const frame = this.frame(time);
     return Array.from({ length: this.legCount }, (_, leg) => this.isSunk(frame, leg));
   }
 
@@ -83,12 +83,21 @@ class Skeleton {
   }
 
   // How far a foot has the colour of what is wrong, 0 to 1.
+  // How deep a foot is in the ground: 1 from where it is marked.
   footShare(leg, time) {
-    return this.sunkLegs(time)[leg] ? 1 : 0;
+    const gap = this.gap[this.legCount * this.frame(time) + leg];
+    return Number.isNaN(gap) ? 0 : Math.min(Math.max(-gap / this.visibleDepth, 0), 1);
   }
 
+  // The redder the deeper it is, the more purple the further it has slid in its stance.
   footColour(leg, time, palette) {
-    return mix(palette[this.key], palette.sunk, this.footShare(leg, time));
+    const slid = this.measuring.slides(this)[this.legCount * this.frame(time) + leg] / this.visibleDepth;
+    const colour = mix(palette[this.key], palette.sliding, Math.min(Math.max(slid, 0), 1));
+    return mix(colour, palette.sunk, this.footShare(leg, time));
+  }
+
+  frame(time) {
+    return Math.min(Math.round(time), this.root.length / 3 - 1);
   }
 }
 
