@@ -82,11 +82,10 @@ class Skeleton {
     return this.gap[this.legCount * frame + leg] < -this.visibleDepth;
   }
 
-  // How far a foot has the colour of what is wrong, 0 to 1.
-  // How deep a foot is in the ground: 1 from where it is marked.
+  // How far a foot has the colour of what is wrong: 1 where it is marked, 0 at half that depth.
   footShare(leg, time) {
-    const gap = this.gap[this.legCount * this.frame(time) + leg];
-    return Number.isNaN(gap) ? 0 : Math.min(Math.max(-gap / this.visibleDepth, 0), 1);
+    const depth = -this.gap[this.legCount * this.frame(time) + leg] / this.visibleDepth;
+    return Math.min(Math.max(2 * depth - 1, 0), 1) || 0; // without ground there is no depth
   }
 
   // The redder the deeper it is, the more purple the further it has slid in its stance.
