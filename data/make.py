@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 import jaxik
@@ -34,7 +35,7 @@ from fitting.experiment import systems
 from fitting.ground import meshes
 from fitting.runtime.precision import in_float64
 from fitting.synthetic import multi_limb, terrain_meshes, walker
-from fitting.synthetic.walker import Slide, Slip, Stop, WalkStyle
+from fitting.synthetic.walker import Slide, Slip, Stop
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
@@ -69,8 +70,8 @@ def stop_and_go() -> Clip:
 
 
 def terraces() -> Clip:
-    """A short walk with slips, knees forward."""
-    return walker.walk(6.0, FPS, 6, SLIPS, WalkStyle(knees=1.0))
+    """A short walk with slips."""
+    return walker.walk(6.0, FPS, 6, SLIPS)
 
 
 def quadruped() -> Clip:
@@ -200,13 +201,29 @@ def reference_motion(reference: SyntheticReference, flat: Clip, terrain: Terrain
 
 
 def with_noise(clip: Clip, seed: int) -> Clip:
-    """The clip with independent normal noise on every joint in every frame."""
-    rng = np.random.default_rng(seed)
-    positions = clip.positions_ws + rng.normal(0.0, POSITION_NOISE, clip.positions_ws.shape)
-    noise = Rotation.from_rotvec(rng.normal(0.0, ROTATION_NOISE, (positions[..., 0].size, 3)))
+    """The clip with independent normal noise on every joint in every frame.
+
+    That of pelvis and legs does not depend on what else there is.
+    """
+    legs, joints = len(walker.LEGS), len(clip.joint_names)
+    parts = [
+        _noise(np.random.default_rng(seeds), clip.frame_count, count)
+        for seeds, count in ((seed, legs), ((seed, 1), joints - legs))
+    ]
+    offsets, angles = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    positions = clip.positions_ws + offsets
+    noise = Rotation.from_rotvec(angles.reshape(-1, 3))
     noisy = noise * Rotation.from_quat(clip.rotations_ws.reshape(-1, 4), scalar_first=True)
     rotations = noisy.as_quat(scalar_first=True).reshape(clip.rotations_ws.shape)
     return clip.with_motion(positions, rotations)
+
+
+def _noise(
+    rng: np.random.Generator, frames: int, joints: int
+) -> tuple[Float64[np.ndarray, "frames joints 3"], Float64[np.ndarray, "frames joints 3"]]:
+    """Offsets, m, and turns as rotation vectors, rad."""
+    offsets = rng.normal(0.0, POSITION_NOISE, (frames, joints, 3))
+    return offsets, rng.normal(0.0, ROTATION_NOISE, (frames * joints, 3)).reshape(offsets.shape)
 
 
 def rounded(clip: Clip) -> Clip:

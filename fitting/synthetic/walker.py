@@ -1,4 +1,4 @@
-"""A synthetic walk: feet placed exactly, swings and pelvis as an average adult's.
+"""A synthetic walk: feet placed exactly, swings, pelvis and arms as an average adult's.
 
 Played directly, the measured curves of `gait` leave feet sliding by centimetres; `footsteps` places
 them instead. The pelvis follows its curve as far as both legs reach their feet (`body`).
@@ -18,14 +18,15 @@ from fitting.clips.assemble import JointMotion, clip_from_joints
 from fitting.clips.clip import Clip
 from fitting.clips.rigs import knee_positions, leg_rotations, unit
 
-from . import footsteps
+from . import footsteps, upper_body
 from .footsteps import SIDES, FootMotion, GroundPath, heading_vectors, sample_footsteps, smoothstep
 
 MAX_REACH = 0.992  # of a leg's length, to which it extends: the knee keeps 15 degrees
 SETTLE = 0.1  # s, before and after the pelvis gives way to a leg
-JOINTS = ("pelvis", "left_hip", "left_knee", "left_ankle", "left_toe",
-          "right_hip", "right_knee", "right_ankle", "right_toe")  # fmt: skip
-PARENTS = (-1, 0, 1, 2, 3, 0, 5, 6, 7)
+LEGS = ("pelvis", "left_hip", "left_knee", "left_ankle", "left_toe",
+        "right_hip", "right_knee", "right_ankle", "right_toe")  # fmt: skip
+JOINTS = (*LEGS, *upper_body.JOINTS)
+PARENTS = (-1, 0, 1, 2, 3, 0, 5, 6, 7, *map(JOINTS.index, upper_body.PARENTS))
 
 FREEZE_PHASE = 0.43  # of the rear foot; the heel of the front one is just down
 EASE = 0.4  # s, shortest transition between walking and freezing, and of a slip
@@ -47,6 +48,10 @@ class Body:
     fps: float
     knees: float = 1.0
     """1 bends the knees forward, as people do, -1 backward, as birds seem to."""
+    phase: Float64[np.ndarray, " frames"] | None = None
+    """Of the steps, in strides; without it the arms hang."""
+    swing: Float64[np.ndarray, " frames"] | float = 1.0
+    """How far arms swing with the steps, 1 as measured."""
 
     @cached_property
     def heading(self) -> Rotation:
@@ -90,10 +95,15 @@ class Body:
             knee = knee_positions(hip, foot.ankle, forward, (footsteps.THIGH, footsteps.SHIN))
             positions += [hip, knee, foot.ankle, foot.ball]
             rotations += [*leg_rotations(hip, knee, foot.ankle, left_ws), foot.rot, foot.rot]
+        phase = np.zeros(len(self.yaw)) if self.phase is None else self.phase
+        swing = np.broadcast_to(0.0 if self.phase is None else self.swing, phase.shape)
+        upper = upper_body.motion(positions[0], self.heading, phase, swing)
         drift = np.broadcast_to(drifted, self.pelvis.shape)
         motion = JointMotion(
-            JOINTS, PARENTS, np.stack(positions, axis=1) + drift[:, None],
-            np.stack(rotations, axis=1), np.stack([foot.stance for foot in self.feet], axis=-1),
+            JOINTS, PARENTS,
+            np.concatenate([np.stack(positions, axis=1), upper[0]], axis=1) + drift[:, None],
+            np.concatenate([np.stack(rotations, axis=1), upper[1]], axis=1),
+            np.stack([foot.stance for foot in self.feet], axis=-1),
             float(self.fps),
         )  # fmt: skip
         return clip_from_joints(motion, source)
@@ -185,8 +195,8 @@ class WalkStyle:
     """rad, about how far the path turns away from +z to either side."""
     variation: float = 1.0
     """Of strides, 1 as measured; 0 makes all alike."""
-    knees: float = -1.0
-    """1 bends the knees forward. The shipped clips, whose fits are published, have -1: backward."""
+    knees: float = 1.0
+    """1 bends the knees forward, -1 backward."""
 
 
 def walk(
@@ -235,7 +245,7 @@ def walk(
         sample_footsteps(leg, strides, path, style.variation, rng).motion(phase, still)
         for leg in range(len(SIDES))
     )
-    body = Body(pelvis, yaw, (left, right), fps, style.knees)
+    body = Body(pelvis, yaw, (left, right), fps, style.knees, phase, cadence)
     breath = BREATH * 0.5 * (1.0 - np.cos(2.0 * np.pi * BREATH_HZ * time))
     clip = body.clip(f"walker seed {seed}", body.sinking() + still * breath, drifted)
     has_slide = any(isinstance(event, Slide) for event in events)

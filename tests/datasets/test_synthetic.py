@@ -123,6 +123,28 @@ def test_motion_is_smooth_where_a_foot_lifts_off_and_lands(name):
         assert np.linalg.norm(np.diff(velocities, axis=0), axis=-1).max() * FPS < 150.0
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_arms_swing_against_the_legs_and_hang_in_a_stop(seed):
+    clip = walker.walk(9.0, FPS, seed, STOPS, STRAIGHT)
+    ahead = {
+        name: clip.positions_ws[:, clip.joint_names.index(name), 2] - clip.positions_ws[:, 0, 2]
+        for name in ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "left_shoulder")
+    }
+    walking = slice(0, int(1.6 * FPS))
+    for side in ("left", "right"):
+        wrist, ankle = ahead[f"{side}_wrist"][walking], ahead[f"{side}_ankle"][walking]
+        assert np.corrcoef(wrist, ankle)[0, 1] < -0.8
+        assert 0.25 < np.ptp(wrist) < 0.6  # m
+    # The chest turns with the arms: with the right leg, and against the left one.
+    assert np.corrcoef(ahead["left_shoulder"][walking], ahead["left_ankle"][walking])[0, 1] < -0.8
+    still = slice(int(3.2 * FPS), int(3.7 * FPS))
+    assert np.ptp(ahead["left_wrist"][still]) < 0.005
+    assert abs(ahead["left_wrist"][still] - ahead["right_wrist"][still]).max() < 0.005
+    wrists = [clip.joint_names.index(f"{side}_wrist") for side in ("left", "right")]
+    accelerations = np.diff(clip.positions_ws[:, wrists], 2, axis=0) * FPS**2
+    assert np.linalg.norm(accelerations, axis=-1).max() < 25.0  # m/s²
+
+
 def test_impossible_motion_is_refused():
     slip, slide, stop = walker.Slip, walker.Slide, walker.Stop
     four_legged, long_legged = multi_limb.QUADRUPED, replace(multi_limb.QUADRUPED, stride=3.0)
@@ -177,7 +199,8 @@ def test_a_slip_moves_standing_feet_and_a_slide_freezes_the_walk_on_both_at_its_
         walker.walk(8.0, FPS, events=events, style=STRAIGHT) for events in ([slip], [])
     )
     moved = slipping.positions_ws - still.positions_ws
-    np.testing.assert_allclose(moved, moved[:, :1] * np.ones((1, 9, 1)), rtol=0, atol=EXACT)
+    together = np.broadcast_to(moved[:, :1], moved.shape)
+    np.testing.assert_allclose(moved, together, rtol=0, atol=EXACT)
     assert np.abs(moved[: round(start * FPS)]).max() < EXACT
     full = (end - start - walker.EASE) * change * SPEED
     assert moved[-1, 0, 2] == pytest.approx(full, rel=0.01)
