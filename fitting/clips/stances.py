@@ -44,6 +44,7 @@ from . import contacts
 from .clip import FASTEST, SLOWEST, Clip
 
 SUFFIX = ".contacts.toml"
+TOPIC = "contacts from "
 DIGITS = 6  # of seconds in a file: a microsecond, a tenth of the shortest frame
 HEAD = """\
 # When the feet of {source} stand: start and end in seconds from its first frame, both included.
@@ -203,7 +204,8 @@ def load_stances(path: Path, clip: Clip) -> Clip:
     legs = check_table(content.legs, known, f"{path} [legs]")
     with error_context(f"{path} [legs]"):
         clip = with_stances(clip, legs)
-    return replace(clip, remarks=(*clip.remarks, f"contacts from {path.name}: {count(clip)}"))
+    others = (remark for remark in clip.remarks if not remark.startswith(TOPIC))
+    return replace(clip, remarks=(*others, f"{TOPIC}{path.name}: {count(clip)}"))
 
 
 def count(clip: Clip) -> str:

@@ -8,6 +8,10 @@ import numpy as np
 from . import contacts, edit
 from .clip import Clip
 from .joint_maps import LEG_ROLES
+from .stances import stances_of
+
+DOUBTFUL = 0.7  # probability of a stance, below which it is named
+MOST_NAMED = 5  # of them
 
 Summary = dict[str, Any]
 
@@ -30,6 +34,8 @@ def describe(clip: Clip) -> Summary:
         warnings.append(f"the last frame is repeated {end - last} times")
     if clip.measured_rig is not None and (jumps := int(edit.marker_jumps(clip).sum())):
         warnings.append(f"markers jump in {jumps} frames")
+    if clip.measured_rig is not None and (text := _doubtful(clip)):
+        warnings.append(text)
     return {
         "file": clip.source,
         "frames": clip.frame_count,
@@ -47,6 +53,24 @@ def describe(clip: Clip) -> Summary:
         "legs": {} if clip.measured_rig is None else _describe_legs(clip),
         "warnings": warnings,
     }
+
+
+def _doubtful(clip: Clip) -> str:
+    """The stances that the program found but that may be none; empty if all are sure."""
+    doubtful = [
+        (stance.probability, f"{leg} from {stance.text} ({stance.probability:.0%})")
+        for leg, stances in stances_of(clip).items()
+        for stance in stances
+        if stance.probability is not None and stance.probability < DOUBTFUL
+    ]
+    if not doubtful:
+        return ""
+    named = [text for _, text in sorted(doubtful)[:MOST_NAMED]]
+    rest = f" and {len(doubtful) - len(named)} more" if len(doubtful) > len(named) else ""
+    return (
+        f"these stances may be none: {', '.join(named)}{rest}; where one is wrong, correct it in a "
+        "contacts file (--contacts prints it)"
+    )
 
 
 def _joint_map(clip: Clip) -> dict[str, str]:

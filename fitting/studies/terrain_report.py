@@ -70,7 +70,8 @@ def reconstruct_terrain(
         terrain = reconstruct(captured, kind=model)
     with activity.announced("Drawing and writing the ground"):
         report = write(mesh, terrain, captured, margin)
-    activity.log(joined([text(report), "", f"written to {mesh}"]))
+    notes = (f"note: {remark}" for remark in captured.remarks)
+    activity.log(joined([text(report), *notes, "", f"written to {mesh}"]))
     return terrain
 
 

@@ -1,12 +1,13 @@
 """Contacts files: when each foot stands, beside a clip, and what becomes of mistakes in them."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
 from fitting.cli import main
-from fitting.clips import Clip, contacts, edit, load_clip, save_clip
+from fitting.clips import Clip, contacts, edit, load_clip, save_clip, summary
 from fitting.clips.stances import (
     Stance,
     contacts_path,
@@ -181,6 +182,13 @@ def test_stances_are_the_less_probable_the_faster_and_the_shorter_they_are():
 
     still, slow, fast, faster = (probabilities(v, labels).mean() for v in (0, 0.1, 0.2, 0.3))
     assert still > slow > fast > 0.5 > faster
+    slid = walk.positions_ws.copy()
+    for joints, speed in zip(walk.rig.joints, (0.23, -0.23), strict=True):
+        slid[:, joints, 0] += speed * np.arange(walk.frame_count)[:, None] / FPS
+    sliding = found.with_motion(slid, walk.rotations_ws)
+    assert not any("may be none" in text for text in summary.describe(found)["warnings"])
+    warning = summary.describe(sliding)["warnings"][-1]
+    assert re.search(r"may be none: (left|right) from .* \([3-6]\d%\), .* and \d more;", warning)
     short = labels & ~np.roll(labels, 6, axis=0)
     assert probabilities(0.0, short).mean() < still - 0.1
 
