@@ -171,15 +171,14 @@ def test_stances_that_are_left_out_do_not_make_ground(walk):
 def test_stances_are_the_less_probable_the_faster_and_the_shorter_they_are():
     walk = stair_walk(flat_floor, 4)
     found = dataclasses.replace(walk, stance=None)
-    whole = [
-        stance.probability or 0.0 for of_leg in stances_of(found).values() for stance in of_leg
-    ]
-    assert min(whole) > 0.95
+    listed = [stance for of_leg in stances_of(found).values() for stance in of_leg]
+    assert min(stance.probability or 0.0 for stance in listed) > 0.95
 
     balls, labels = walk.joints_ws(3), found.stance_labels()
 
     def probabilities(drift: float, stance: np.ndarray) -> np.ndarray:
-        slid = balls + [0.0, 0.0, drift] * np.arange(len(balls))[:, None, None] / FPS
+        seconds = np.arange(len(balls))[:, None, None] / FPS
+        slid = balls + seconds * [0.0, 0.0, drift]
         return contacts.stance_probability(slid, stance, FPS)[stance]
 
     still, slow, fast, faster = (probabilities(v, labels).mean() for v in (0, 0.1, 0.2, 0.3))
