@@ -153,6 +153,20 @@ class View:
     packed: Sequence[Content] = ()
     """Instead of `clips`, what a page holds of them: of a document that was stored."""
 
+    def page(self, kind: str, title: str) -> str:
+        """A page of the view alone, as HTML."""
+        return pages.render(
+            "view.html",
+            self.packed or motion_data.pack(self.clips),
+            kind=kind,
+            title=title,
+            names=self.names,
+            visible=self.visible,
+            stands=self.stands,
+            watched=self.watched,
+            layers={},
+        )
+
 
 @dataclass(frozen=True)
 class Document:

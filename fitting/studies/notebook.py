@@ -10,17 +10,20 @@ from matplotlib.figure import Figure
 import jaxik
 from fitting.experiment.experiment import Experiment
 from fitting.inference.sample.posterior import Posterior
-from fitting.report.document import Document, Grid, Plot, blocks_of
+from fitting.report.document import Document, Grid, Plot, View, blocks_of
 from fitting.report.formatting import Table, interval, number
 from fitting.runtime import display
 from jaxik.maths import parameter_tree
 
 from .comparison import Comparison, document
-from .fit import fit_plots, fit_tables
+from .fit import fit_plots, fit_report, fit_tables
 from .fit.fit import Fit
 from .sample import posterior_report
 
 LEFT = Markup(' style="text-align: left"')
+VIEW = Markup(
+    '<iframe title="{}" style="width: 100%; height: 800px; border: 0" srcdoc="{}"></iframe>'
+)
 PICTURE = Markup('<img style="max-width: 100%" alt="{}" src="data:image/png;base64,{}">')
 MOST_PIXELS = 1200  # of a picture's width
 
@@ -97,6 +100,15 @@ def picture(figure: Figure, description: str) -> Markup:
     return PICTURE.format(description, base64.b64encode(out.getvalue()).decode())
 
 
+def motion(view: View | None, kind: str, title: str) -> Markup:
+    """A view in 3-D inside the page; nothing where there is none."""
+    return (
+        Markup("")
+        if view is None
+        else VIEW.format(f"{kind}: {title}", WIDE, view.page(kind, title))
+    )
+
+
 def _row(tag: str, cells: Sequence[str]) -> Markup:
     marked = [Markup(f"<{tag}{LEFT}>") + escape(cell) + Markup(f"</{tag}>") for cell in cells]
     return Markup("<tr>") + Markup("").join(marked) + Markup("</tr>")
@@ -114,6 +126,7 @@ def fit_html(fitted: Fit) -> str:
         f"Fit: {fitted.experiment.name}",
         sentences([fitted.solution.message, fitted.verdict.sentence]),
         table(fit_tables.parameter_table(fitted.parameters, fitted.known_values)),
+        motion(fit_report.fit_view(fitted), "Fit", fitted.experiment.name),
         picture(figure, title),
     )
 
@@ -127,8 +140,16 @@ def posterior_html(posterior: Posterior) -> str:
         "Posterior",
         sentences([posterior.message]),
         table(posterior_report.posterior_table(posterior, None, {})),
+        motion(_draws(posterior), "Posterior", "motions of draws"),
         picture(figure, title),
     )
+
+
+def _draws(posterior: Posterior) -> View | None:
+    if posterior.source is None:
+        return None
+    problem, clips = posterior.source
+    return posterior_report.draws_view(posterior, problem, clips) if clips else None
 
 
 @display.html.register
@@ -138,8 +159,8 @@ def comparison_html(comparison: Comparison) -> str:
 
 
 def document_html(document: Document) -> str:
-    """The document in brief, with its plots."""
-    parts: list[Markup] = []
+    """The document in brief, with its view and its plots."""
+    parts = [motion(document.view, document.kind, document.title)]
     for block in blocks_of(document.sections):
         if isinstance(block, Grid) and block.brief:
             parts.append(table(block.rows))

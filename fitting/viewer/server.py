@@ -75,14 +75,14 @@ class Viewer:
         finally:
             self._ready.set()
 
-    def page(self) -> str:
-        """The page, with its first clip; until that is solved one that asks again."""
+    def page(self, *, wait: bool = False) -> str:
+        """The page, with its first clip; until that is solved one that asks again, or none."""
         session = self.session
-        if not self._ready.is_set():
+        if not self._ready.wait(None if wait else 0.0):
             return pages.render("waiting.html", [], title=session.title)
         first = self.clip(0)
         return pages.render(
-            "live.html",
+            "view.html",
             [first, *[None] * (len(session.clips) - 1)],
             is_remote=True,
             kind="Move parameters, and see the motion",
@@ -90,6 +90,7 @@ class Viewer:
             names=[clip.name for clip in session.clips],
             visible=f"{100 * first['visibleDepth']:.2g} cm",
             stands="captured" if session.clips[0].animation.captured else "animated",
+            watched="solved motion",
             layers=LAYERS,
         )
 

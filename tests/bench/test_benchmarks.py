@@ -1,5 +1,6 @@
 """`jaxik bench`: how it measures, counts and reports; each benchmark runs at small sizes."""
 
+import base64
 import dataclasses
 import json
 import os
@@ -8,7 +9,6 @@ import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +25,7 @@ from fitting.codegen.crowd import NoKernelError
 from fitting.inference.optimise.search import find_best_fit
 from fitting.runtime import machine
 from fitting.runtime.threads import usable_cores
+from fitting.viewer import Tuning
 from fitting.viewer.session import DEFAULT
 from jaxik import presets
 from jaxik.world.surfaces import Mesh
@@ -498,21 +499,28 @@ def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_ste
     assert figure.value == timings.samples["chain"][0]
 
 
-def test_a_drag_is_measured_without_its_compilation(monkeypatch):
-    systems = []
+def test_a_drag_is_measured_without_its_compilation_and_pages_by_their_size(monkeypatch):
+    requests = []
     ik, clip = presets.record(), workloads.walk(12)
-    session = SimpleNamespace(starts={DEFAULT: ik}, rig=clip.rig, free=())
-    solver = SimpleNamespace(solve=systems.append, animation=SimpleNamespace(clip=clip))
+    animation = SimpleNamespace(clip=clip)
+    session = SimpleNamespace(
+        starts={DEFAULT: ik}, rig=clip.rig, free=(), clips=[SimpleNamespace(animation=animation)]
+    )
+    viewer = SimpleNamespace(
+        tuning=Tuning(session), clip=int, solve=requests.append, page=lambda wait: "a" * 2_000_000
+    )
     monkeypatch.setattr(benchmarks, "viewed_walk", lambda frame_count: session)
-    monkeypatch.setattr(benchmarks, "Solver", lambda session: solver)
+    monkeypatch.setattr(benchmarks, "Viewer", lambda session, folder: viewer)
     timings = measure("view")
-    (figure,) = timings.figures
-    assert figure.at_most == 100.0 and figure.unit == "ms"
+    figure, *pages = timings.figures
+    assert figure.at_most == 50.0 and figure.unit == "ms"
     assert figure.value == pytest.approx(1e3 * np.median(timings.samples["drag"]))
-    assert timings.compile_s["solve"] > 0
-    first, *dragged = systems
-    assert first is ik and len(dragged) == 2 + SMALL.repeats
-    assert not any(eqx.tree_equal(ik, other) for other in dragged)
+    assert [page.value for page in pages] == [2.0, 2.0] and pages[0].at_most == 8.0
+    assert timings.compile_s["solve"] > 0 and len(requests) == 2 + SMALL.repeats
+    own = viewer.tuning.numbers(ik)
+    for request in requests:
+        moved = np.frombuffer(base64.b64decode(request["values"]))
+        assert (moved != own).sum() == 1
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
 import base64
+import html
 import json
 import math
 import re
@@ -43,8 +44,9 @@ from fitting.studies.sample.sample import SampledFit
 from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
-from support import toy
+from support import runs, toy
 from support.experiments import write
+from support.pages import Page
 from support.problems import posterior_of, problem_of
 from support.profiles import parabolas
 
@@ -574,6 +576,7 @@ def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp
 
 def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted):
     text = fitted._repr_html_()
+    assert "<iframe" not in text  # it has no clips
     (parameters,) = tables(text)
     assert [row[0] for row in parameters[1:]] == list(VALUES)
     (picture,) = pictures(text)
@@ -584,6 +587,25 @@ def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted
     np.testing.assert_array_equal(table["value"], fitted.solution.values)
     intervals = [row["interval"] for row in fitted.parameters]
     np.testing.assert_array_equal(table[["low95", "high95"]], intervals)
+
+
+def test_a_notebook_shows_the_motion_of_a_fit_and_of_draws_of_a_posterior(tmp_path):
+    fitted = runs.with_clips(runs.invented_fit(tmp_path))
+    frame = view_of(fitted._repr_html_(), tmp_path)
+    labels = [skeleton["label"] for skeleton in frame.data["clips"][0]["skeletons"]]
+    assert labels == ["flat animation", "before the fit", "captured", "fitted"]
+    posterior = replace(toy_posterior(), source=(fitted.problem, fitted.clips))
+    frame = view_of(posterior._repr_html_(), tmp_path)
+    labels = [skeleton["label"] for skeleton in frame.data["clips"][0]["skeletons"]]
+    assert labels == ["flat animation", "captured", *(f"draw {n}" for n in range(1, 6))]
+
+
+def view_of(text: str, folder: Path) -> Page:
+    """The page of a view inside that of a notebook."""
+    (source,) = re.findall(r'srcdoc="([^"]+)"', text)
+    path = folder / "view.html"
+    path.write_text(html.unescape(source))
+    return Page(path)
 
 
 def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):

@@ -106,6 +106,8 @@ class Posterior(Displayable):
     """Of the point around which the walkers started."""
     blocks: BlockLogLikelihood | None = None
     """Of some draws; None until they are run through the clips (`studies.sample.replay`)."""
+    source: Any = dataclasses.field(default=None, repr=False, compare=False)
+    """The problem and the clips that it is of, whose motion notebooks show; None if unknown."""
 
     @property
     def draws(self) -> Float[np.ndarray, "steps walkers free"]:

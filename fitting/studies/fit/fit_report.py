@@ -151,6 +151,16 @@ def fit_document(
     )
 
 
+@in_float64
+def fit_view(fitted: Fit) -> View | None:
+    """The motions of a fit, also with the system before it; None for a fit without clips."""
+    if not fitted.clips:
+        return None
+    before = WarmUp(fitted.problem).results()
+    every = zip(fitted.clips, before, fitted.results, strict=False)
+    return _view(fitted, [fit_motions.clip_motions(*results) for results in every])
+
+
 def _view(fitted: Fit, motions: Sequence[ClipMotions]) -> View:
     windows = map(worst_window.find_worst_window, fitted.playbacks)
     labels = [scene.reference.label for scene in fitted.problem.data]

@@ -11,13 +11,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
+import jaxik
+from fitting.clips.clip_frames import raised
+from fitting.experiment.problems import ClipData
+from fitting.ground import ground_path
 from fitting.inference.sample.blocks import SECONDS, BlockLogLikelihood, LeaveOneOut
 from fitting.inference.sample.diagnostics import ParameterSummary
 from fitting.inference.sample.modes import MIN_EXCHANGES, Mode
 from fitting.inference.sample.posterior import Posterior
 from fitting.inference.sample.prior_sensitivity import MAX_K, Reweighted
+from fitting.motion import playback
+from fitting.motion.measures import place, with_soles_of
+from fitting.problem.capture_system import system_and_scenes
+from fitting.problem.problem import Problem
 from fitting.problem.space import Space, prior_probability
-from fitting.report import document, pages
+from fitting.report import document, motion_data, pages
 from fitting.report.document import (
     Block,
     Document,
@@ -28,12 +36,15 @@ from fitting.report.document import (
     Points,
     Section,
     Text,
+    View,
     brief,
 )
 from fitting.report.formatting import RESIDUALS, Table, interval, number, percent
+from fitting.report.motion_data import Appearance, ViewedClip, ViewedMotion
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, legend, line_key, styled
 from fitting.runtime import activity
-from fitting.studies.fit import fit_tables
+from fitting.runtime.precision import in_float64
+from fitting.studies.fit import fit_motions, fit_tables
 from fitting.studies.fit.fit_tables import Truth
 from fitting.studies.fit.run_folder import LOWER_POINT
 
@@ -42,6 +53,8 @@ from .sample import SampledFit
 
 TEXT = "posterior.md"
 MAX_CLIPS = 4  # that are drawn
+SHOWN_DRAWS = 5  # whose motion a view shows
+DRAW = Appearance(AFTER, 1.0, 0.3)
 
 WORST = 5  # blocks in the table
 SENSITIVE = (
@@ -159,6 +172,57 @@ def _health(posterior: Posterior) -> list[str]:
         f"Stuck walkers: {stuck}.",
         *mode_sentences(posterior),
     ]
+
+
+@in_float64
+def draws_view(
+    posterior: Posterior, problem: Problem[jaxik.FootIK], clips: Sequence[ClipData]
+) -> View:
+    """The motion that some draws of a posterior give, beside the captured one.
+
+    Args:
+        posterior: converged or not.
+        problem: that was sampled.
+        clips: of the problem.
+    """
+    draws = posterior.draws_u.reshape(-1, len(posterior.names))
+    chosen = draws[np.linspace(0, len(draws) - 1, SHOWN_DRAWS).astype(int)]
+    played = []
+    for u in chosen:
+        system, scenes = system_and_scenes(problem, u)
+        played.append(playback.run_all(system, scenes))
+    viewed = [
+        _viewed_draws(clip, [results[number] for results in played])
+        for number, clip in enumerate(clips)
+    ]
+    depth = 100 * viewed[0].reference.measures.visible
+    names = [clip.reference.source for clip in clips]
+    return View(viewed, names, f"{depth:.2g} cm", stands="captured", watched="watched draw")
+
+
+def _viewed_draws(clip: ClipData, results: Sequence[jaxik.Result]) -> ViewedClip:
+    """A clip as captured and as some draws give it."""
+    animated = raised(clip.base, clip.root.rise)
+    solved = {
+        f"draw {draw}": fit_motions.fitted_clip(clip, result)
+        for draw, result in enumerate(results, 1)
+    }
+    captured = with_soles_of(clip.reference, clip.base)
+    placed = {
+        name: place(motion, animated, clip.base, clip.terrain)
+        for name, motion in {"flat animation": animated, "captured": captured, **solved}.items()
+    }
+    looks = {"flat animation": motion_data.ANIMATED, "captured": motion_data.CAPTURED}
+    return ViewedClip(
+        {
+            name: ViewedMotion(name, motion, looks.get(name, DRAW), name != "flat animation")
+            for name, motion in placed.items()
+        },
+        clip.reference.stance_labels(),
+        clip.base,
+        ground_path.around_path(clip.reference, clip.terrain),
+        watched="draw 1",
+    )
 
 
 def posterior_table(posterior: Posterior, truth: Truth, units: Mapping[str, str]) -> Table:

@@ -67,6 +67,7 @@ def sample(
     with output_folder(run):
         chain = None if run is None else run / run_folder.CHAIN
         posterior = sample_around(parameters, problem, experiment, chain)
+        posterior = replace(posterior, source=(problem, clips))
         if posterior.interrupted:
             activity.log("interrupted; summarising and writing the chain so far")
         played = None
