@@ -444,10 +444,15 @@ def _largest_angle(rots: Array | np.ndarray) -> float:
     return float(np.degrees(2.0 * np.arctan2(sines, cosines)).max())
 
 
-def arrays(motion: measures.PlacedMotion) -> dict[str, np.ndarray]:
-    """The arrays beside a solved clip in its file: positions by role, and `placement` as JSON."""
+def arrays(motion: measures.PlacedMotion, animated: Clip) -> dict[str, np.ndarray]:
+    """The arrays beside a solved clip in its file.
+
+    They are positions by role; `contact`, (frames, legs), 1 where the foot of the animation stands;
+    and `placement` as JSON.
+    """
     described = np.array(json.dumps(motion.measures.numbers()))
-    return positions_by_role(motion.clip) | {"placement": described}
+    contact = animated.stance_labels().astype(np.float64)
+    return positions_by_role(motion.clip) | {"contact": contact, "placement": described}
 
 
 def warn(
@@ -539,7 +544,7 @@ def solve(
         motion = loaded.place(solved, result)
         cause = loaded.cause(motion)
     if path is not None:
-        joints = arrays(motion)
+        joints = arrays(motion, loaded.clip)
         ground = mesh_of(loaded.terrain) if with_terrain else None
         save_clip(path, solved, joints=joints, ground=ground)
     written = "" if path is None else f"; written to {path}"
