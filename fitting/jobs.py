@@ -19,6 +19,7 @@ from .studies.calibrate.wrong_model import calibrate_wrong_model as calibrate_wr
 from .studies.comparison import compare as compare
 from .studies.draft import init as init
 from .studies.exports import export as export
+from .studies.exports import export_blender_addon as export_blender_addon
 from .studies.exports import export_code as export_code
 from .studies.fit.fit_jobs import fit as fit
 from .studies.many.fit_many import fit_many as fit_many

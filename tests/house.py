@@ -58,7 +58,9 @@ class Package:
     """The source of a package, parsed."""
 
     def __init__(self, name: str):
-        self.files = sorted((ROOT / name).rglob("*.py"))
+        # Not what runs in other programs, such as Blender, and is no package here.
+        files = (ROOT / name).rglob("*.py")
+        self.files = sorted(path for path in files if (path.parent / "__init__.py").exists())
         self.trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in self.files}
         self.modules = [path for path in self.files if path.stem != "__init__"]
         self.nodes = [node for tree in self.trees.values() for node in ast.walk(tree)]

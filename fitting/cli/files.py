@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from jaxik.record import Reading, Record
 
 LANGUAGES = ("c", "cs", "js")  # of code
+ADDON = "blender-addon"
 TEMPLATE = Path()
 """What `--joints` is without a file: no name that a file can have."""
 
@@ -253,13 +254,15 @@ record = Command(
 
 @command(
     argument(
-        "source", type=Path, metavar="SOURCE",
-        help="folder of a run, parameter .toml or .json, record .bin or .csv, or settings",
+        "source", type=Path, metavar="SOURCE", nargs="?",
+        help="folder of a run, parameter .toml or .json, record .bin or .csv, or settings; none "
+        "for the add-on",
     ),
     output("FILE", ".toml, .json, .csv or .bin"),
     argument(
-        "--as", dest="form", choices=("ozz", "unreal", "mec", *LANGUAGES),
-        help="write the settings of this system, or code (default: parameters, or a record)",
+        "--as", dest="form", choices=("ozz", "unreal", "mec", *LANGUAGES, ADDON),
+        help="write the settings of this system, code, or the add-on for Blender (default: "
+        "parameters, or a record)",
     ),
     flag("--drop", "leave out what the record or settings cannot hold"),
     group(
@@ -284,7 +287,7 @@ record = Command(
     ),
 )  # fmt: skip
 def export(options: argparse.Namespace) -> int:
-    """Write parameters as TOML, JSON, the game's record, settings or code.
+    """Write parameters as TOML, JSON, the game's record, settings or code; or Blender's add-on.
 
     jaxik export runs/walk -o walk.json               parameters under our names
     jaxik export runs/walk -o footik.bin              the game's record, or as .csv
@@ -294,6 +297,7 @@ def export(options: argparse.Namespace) -> int:
     jaxik export runs/walk --as c -o walk --trace walk.bvh --terrain steps.obj
     jaxik export runs/walk --as cs -o walk --axes unity    and in C#, for Unity
     jaxik export runs/walk --as js -o walk            and as a module of JavaScript
+    jaxik export --as blender-addon -o addon          what Blender installs from disk
 
     What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
     it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's
@@ -304,6 +308,16 @@ def export(options: argparse.Namespace) -> int:
 
     code = {name: getattr(options, name) for name in ("trace", "terrain", "legs", "name", "axes")}
     wanted = [f"--{name}" for name, value in code.items() if value is not None]
+    if options.form == ADDON:
+        if options.source is not None or options.drop or wanted:
+            raise ValueError(
+                f"--as {ADDON} takes only -o: in Blender one chooses a preset or a parameter file"
+            )
+        path = jobs.export_blender_addon(options.output)
+        print(f"written to {path}; in Blender, choose Install from Disk under Get Extensions")
+        return 0
+    if options.source is None:
+        raise ValueError("there is no SOURCE; wanted a run, or a file of parameters")
     if options.form in LANGUAGES:
         _export_code(options)
     elif wanted:

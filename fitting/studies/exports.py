@@ -12,6 +12,7 @@ from typing import NamedTuple
 import fitting
 import jaxik
 from fitting.clips.clip_frames import frames_from_clip
+from fitting.codegen.blender import write_addon
 from fitting.codegen.export import GoldenTrace, export_system
 from fitting.codegen.program import blank_rig
 from fitting.experiment import originals, parameter_files, record_files
@@ -126,6 +127,22 @@ def export_code(
         export_system(
             loaded.ik, rig, folder, language=language, name=name, axes=axes, golden=golden
         )
+
+
+def export_blender_addon(folder: str | Path) -> Path:
+    """Writes the add-on for Blender; see `fitting.codegen.blender`.
+
+    Args:
+        folder: where the zip goes; it is made if missing.
+
+    Returns:
+        The path of the zip.
+
+    Raises:
+        ValueError: the folder cannot be made.
+    """
+    run_folder.check_output_folder(Path(folder))
+    return write_addon(folder)
 
 
 def load(source: Path) -> Source:
