@@ -35,6 +35,11 @@ ROOTS = [
     ("animation", "As animated", "The root stays where it is"),
     ("ground", "On the ground", "The root follows the ground below it"),
 ]
+TRAVELS = [
+    ("auto", "Automatic", "A walk in place travels as its stances imply"),
+    ("stances", "By stances", "The root travels so that standing feet stay put"),
+    ("none", "As animated", "The root travels as it does"),
+]
 
 
 class Running:
@@ -68,8 +73,15 @@ class JaxikSettings(bpy.types.PropertyGroup):
         name="File", subtype="FILE_PATH", description="parameters.toml of a run of jaxik"
     )
     root: EnumProperty(name="Root", items=ROOTS, description="Height of the whole character")
+    travel: EnumProperty(name="Travel", items=TRAVELS, description="Way of the whole character")
     floor: FloatProperty(
         name="Floor", subtype="DISTANCE", description="Height on which the animation was made"
+    )
+    sole: FloatProperty(
+        name="Sole",
+        subtype="DISTANCE",
+        min=0.0,
+        description="Height of the balls of the feet over their soles; 0 is measured",
     )
     metres: FloatProperty(
         name="Metres per unit",
@@ -269,6 +281,8 @@ def order_of(context) -> job.Order:
         system=settings.system,
         parameters=bpy.path.abspath(settings.parameters),
         root=settings.root,
+        travel=settings.travel,
+        sole=settings.sole,
         floor=settings.floor,
         metres=settings.metres or unit,
         bones=bones,
@@ -310,9 +324,9 @@ class JAXIK_PT_placement(Panel, bpy.types.Panel):
     bl_label, bl_parent_id, bl_options = "Placement", "JAXIK_PT_foot_ik", {"DEFAULT_CLOSED"}
 
     def draw(self, context) -> None:
-        """Root, floor and scale."""
+        """Root, floor, soles and scale."""
         self.layout.use_property_split = True
-        for name in ("root", "floor", "metres"):
+        for name in ("root", "travel", "floor", "sole", "metres"):
             self.layout.prop(context.scene.jaxik, name)
 
 

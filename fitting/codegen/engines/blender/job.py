@@ -34,8 +34,12 @@ class Order(NamedTuple):
     """Path of a file of parameters."""
     root: str
     """As `jaxik run --root` takes it."""
+    travel: str
+    """As `jaxik run --travel` takes it."""
     floor: float
     """Height of the floor of the animation, in units of the scene."""
+    sole: float
+    """Height of the balls of the feet over their soles, in units of the scene; 0 is measured."""
     metres: float
     """Of one unit of the scene."""
     bones: dict[str, str]
@@ -69,6 +73,7 @@ def bake(context: bpy.types.Context, order: Order) -> Iterator[Step]:
             yield Step(text, 0.4, waits=True)
         solution = exchange.read_solution(folder / SOLVED, sampled.motion)
         remarks = process.remarks(folder)
+    yield Step("reading what jaxik has done", 0.6)
     solved = solution._replace(motion=exchange.z_up(solution.motion, order.metres))
     armature = _object(order.armature)
     if not sampled.is_of(armature):
@@ -113,7 +118,9 @@ def _few(names: list[str]) -> str:
 def _words(order: Order, folder: Path) -> list[str]:
     """The arguments of jaxik; writes the bones, where they are known."""
     words = ["run", CLIP, "--terrain", GROUND, "-o", SOLVED, "--root", order.root]
-    words += ["--floor", repr(order.floor * order.metres)]
+    words += ["--travel", order.travel, "--floor", repr(order.floor * order.metres)]
+    if order.sole:
+        words += ["--sole", repr(order.sole * order.metres)]
     if order.system == FILE:
         words += ["--parameters", order.parameters]
     elif order.system != AUTO:

@@ -1,6 +1,7 @@
 """Finds jaxik, which lives in a Python of its own, and runs it beside Blender."""
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -21,7 +22,15 @@ START = "import sys; from fitting.cli.start import main; sys.exit(main())"
 EXPORTER = Path(__file__).with_name("python.txt")
 """Names the Python of the jaxik that wrote this add-on."""
 WARNING, NOTE = "jaxik: ", "note: "  # begin lines of stderr and stdout
-SCALE = "give --scale (scale=... in Python)"
+IN_PYTHON = re.compile(r" \(\w+=\.\.\. in Python\)")
+FIELDS = {
+    "--root ground": "Root On the ground",
+    "--scale": "Metres per unit",
+    "--floor": "Floor",
+    "--sole": "Sole",
+    "--travel": "Travel",
+}
+"""What the panel calls the options that jaxik advises."""
 UNKNOWN_LEGS = "no pair of legs recognised"
 ADVICE = "; write a map with"
 
@@ -86,7 +95,15 @@ def remarks(folder: Path) -> list[str]:
         for line in _lines(folder / stream)
         if line.startswith(beginning)
     ]
-    return [line.replace(SCALE, "set Metres per unit, under Placement,") for line in lines]
+    return [_in_fields(line) for line in lines]
+
+
+def _in_fields(line: str) -> str:
+    """Advice as the panel has it."""
+    line = IN_PYTHON.sub("", line)
+    for option, field in FIELDS.items():
+        line = line.replace(option, field)
+    return line
 
 
 def _reason(lines: list[str], status: int) -> str:

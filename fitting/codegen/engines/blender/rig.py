@@ -183,7 +183,9 @@ def plan(armature: bpy.types.Object, sampled: Sample, solved: Solution) -> Itera
     wanted[..., :3, :3] = turns @ sampled.motion.rotations[:, :count].swapaxes(-1, -2) @ linear
     wanted[..., :3, 3] = heads
     wanted = np.linalg.inv(sampled.world)[:, None] @ wanted
+    yield 0.0
     moving, muted = _moving(armature, sampled, solved.motion)
+    yield 0.0
     channels = []
     for number, bone in enumerate(moving):
         channels += _channels(armature.pose.bones[sampled.names[bone]], bone, sampled, wanted)
@@ -264,8 +266,8 @@ def _channels(
     shift = np.abs(np.array(locations) - own_locations).max() * size
     if shift > MOVED and rest.use_connect:
         raise Refusal(
-            f"{bone.name} is connected to {rest.parent.name}, and has to move by "
-            f"{shift * 100:.2g} hundredths of a unit; clear Connected in Edit Mode"
+            f"{bone.name} would have to leave {rest.parent.name}, to which it is connected, by "
+            f"{shift:.2g} units; clear Connected in Edit Mode, or let no bone stretch"
         )
     if shift > MOVED:
         channels.append(("location", np.array(locations)))
