@@ -165,7 +165,7 @@ def plan(armature: bpy.types.Object, sampled: Sample, solved: Solution) -> Itera
     """Works out a bake, a bone a step; yields how much is done, and returns a `Bake`.
 
     Scales and shears of the armature and its bones stay. Only those bones are baked that jaxik has
-    moved against their parents, or that the same constraint moves.
+    moved against their parents, or that do not follow these by themselves.
 
     Args:
         armature: the object.
@@ -201,13 +201,13 @@ def plan(armature: bpy.types.Object, sampled: Sample, solved: Solution) -> Itera
 def _moving(
     armature: bpy.types.Object, sampled: Sample, solved: Motion
 ) -> tuple[list[int], list[tuple[str, str]]]:
-    """The bones that a motion moves against their parents, and the constraints on these."""
+    """The bones that a motion moves against what they follow, and their constraints."""
     off = _changes(relative(sampled.motion), relative(solved))
     off_in_world = _changes(sampled.motion[2:], solved[2:])
     moving = {
         name
         for number, name in enumerate(sampled.names)
-        if (off if _follows_all(armature.data.bones[name]) else off_in_world)[number] > MOVED
+        if (off if _follows_all(armature.pose.bones[name]) else off_in_world)[number] > MOVED
     }
     muted: dict[tuple[str, str], None] = {}
     again = _muted_for(armature.animation_data.action)
@@ -230,9 +230,11 @@ def _changes(before: tuple, after: tuple) -> np.ndarray:
     return np.maximum(shifts.max(axis=(0, 2)), turns.max(axis=(0, 2, 3)))
 
 
-def _follows_all(bone: bpy.types.Bone) -> bool:
+def _follows_all(posed: bpy.types.PoseBone) -> bool:
     """Whether a bone moves with its parent in every way."""
-    return bone.use_inherit_rotation and bone.use_local_location and bone.inherit_scale == "FULL"
+    bone = posed.bone
+    inherits = bone.use_inherit_rotation and bone.use_local_location
+    return inherits and bone.inherit_scale == "FULL" and not posed.constraints
 
 
 def _chain(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint) -> set[str]:
