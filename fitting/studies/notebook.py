@@ -21,9 +21,8 @@ from .fit.fit import Fit
 from .sample import posterior_report
 
 LEFT = Markup(' style="text-align: left"')
-VIEW = Markup(
-    '<iframe title="{}" style="width: 100%; height: 800px; border: 0" srcdoc="{}"></iframe>'
-)
+VIEW = Markup('<iframe title="{}" style="{}" srcdoc="{}"></iframe>')
+WIDE = "width: 100%; height: 800px; border: 0"
 PICTURE = Markup('<img style="max-width: 100%" alt="{}" src="data:image/png;base64,{}">')
 MOST_PIXELS = 1200  # of a picture's width
 
