@@ -49,12 +49,12 @@ def with_wrong_labels(clip: Clip) -> Clip:
 
 
 def corrected_by_hand(clip: Clip, wrong: Clip) -> Clip:
-    """The clip with the stances that were wrong a frame off, as a hand leaves them."""
-    off = iter((1, -1, 1, -1, 1, -1, 1))
+    """The clip with wrong stances put right to within a frame, as a hand does it."""
+    random = np.random.default_rng(1)
 
     def dragged(stance: Stance) -> Stance:
-        by = next(off) / clip.fps
-        return by_hand(stance, by, by)
+        start, end = int(random.integers(-1, 2)), int(random.integers(-1, 2))
+        return by_hand(stance, start / clip.fps, end / clip.fps)
 
     known = stances_of(wrong)
     return with_stances(
