@@ -49,7 +49,7 @@ from jaxik.stages.leg import LegGoal, SolvedLeg
 from jaxik.world import terrain
 from jaxik.world.terrain import Hit, Terrain, cast, plane
 
-from . import baselines, crowds, processes, workloads
+from . import baselines, processes, workloads
 from .measurement import (
     Benchmark,
     Call,
@@ -439,7 +439,7 @@ def crowd(measurement: Measurement, sizes: Sizes) -> None:
         start, size = time.perf_counter(), min(usable_cores() * sizes.chunk, sizes.characters)
         measurement.progress(f"crowd: compiling {name} in C")
         try:
-            calls[f"{name}, C"], kernels[name] = crowds.by_kernel(people, ground, size)
+            calls[f"{name}, C"], kernels[name] = baselines.by_kernel(people, ground, size)
         except NoKernelError as error:
             measurement.notes.append(f"{name} by JAX only: {error}")
         else:

@@ -6,9 +6,10 @@ eagerly, it compiles anew for every number of frames: 1.5 s on two cores, agains
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,7 +21,6 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts, skating
 from .joint_maps import ADVICE, find_roles
-from .model import Model
 from .rigs import left_directions, rotation
 from .skating import Skating
 
@@ -38,6 +38,24 @@ Positions = Float64[np.ndarray, "frames joints 3"]
 Rotations = Float64[np.ndarray, "frames joints 4"]  # wxyz
 JUMP = 0.5  # of a leg's length
 JUMP_RATIO = 4.0  # a runner filmed at 5 Hz moves as far in each frame, but evenly
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A glTF file with a skinned mesh, whose animation can be replaced.
+
+    No node of its skeleton is scaled differently along its axes.
+    """
+
+    header: Mapping[str, Any]
+    """Its JSON; all buffers are one, the binary part."""
+    binary: bytes
+    nodes: Mapping[str, int]
+    """Number of the node of each joint, by the joint's name."""
+    scales: Mapping[str, float]
+    """Of each joint in the world, m for each unit of length in its space."""
+    above: Float64[np.ndarray, "4 4"]
+    """From the space in which the skeleton's root is placed to the world."""
 
 
 @dataclass(frozen=True, eq=False)

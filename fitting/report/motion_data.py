@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from fitting.clips import Clip
-from fitting.clips.model import Model
+from fitting.clips.clip import Model
 from fitting.ground.ground_path import GroundPatch
 from fitting.motion import measures
 from fitting.motion.measures import PlacedMotion

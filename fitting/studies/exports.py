@@ -4,15 +4,18 @@ Those lie in the folder `data` of the repository. A wheel has them in `fitting/e
 """
 
 import os
+import sys
 import tomllib
+import zipfile
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
 import fitting
 import jaxik
+from fitting import codegen
 from fitting.clips.clip_frames import frames_from_clip
-from fitting.codegen.blender import write_addon
 from fitting.codegen.export import GoldenTrace, export_system
 from fitting.codegen.program import blank_rig
 from fitting.experiment import originals, parameter_files, record_files
@@ -33,6 +36,11 @@ OURS = (".toml", ".json", ".csv", ".bin")  # parameters, parameters, record, rec
 PACKAGE = Path(str(fitting.__file__)).parent
 INSTALLED, REPOSITORY = PACKAGE / "examples", PACKAGE.parent / "data"
 SCHEMA = "experiment.schema.json"  # beside a copied experiment, for editors
+
+ADDON = Path(str(codegen.__file__)).parent / "engines" / "blender"
+MANIFEST = "blender_manifest.toml"
+ENTRY = "addon.py"  # a package in the zip, but none there, where it could not be imported
+ARCHIVE = "jaxik-blender.zip"
 
 
 class Source(NamedTuple):
@@ -130,7 +138,9 @@ def export_code(
 
 
 def export_blender_addon(folder: str | Path) -> Path:
-    """Writes the add-on for Blender; see `fitting.codegen.blender`.
+    """Writes the add-on for Blender 4.2 and newer as a zip, which Blender installs from disk.
+
+    It calls the `jaxik` of the Python that runs this, unless its preferences name another.
 
     Args:
         folder: where the zip goes; it is made if missing.
@@ -139,10 +149,26 @@ def export_blender_addon(folder: str | Path) -> Path:
         The path of the zip.
 
     Raises:
-        ValueError: the folder cannot be made.
+        ValueError: the folder cannot be made, or the zip cannot be written.
     """
     run_folder.check_output_folder(Path(folder))
-    return write_addon(folder)
+    contents = {
+        "__init__.py" if path.name == ENTRY else path.name: path.read_text(encoding="utf-8")
+        for path in sorted(ADDON.iterdir())
+        if path.suffix in (".py", ".toml")
+    }
+    contents[MANIFEST] = contents[MANIFEST].replace("VERSION", metadata.version("jaxik"))
+    contents["python.txt"] = sys.executable
+
+    def fill(path: Path) -> None:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, text in contents.items():
+                archive.writestr(name, text)
+
+    path = Path(folder) / ARCHIVE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write(path, fill)
+    return path
 
 
 def load(source: Path) -> Source:

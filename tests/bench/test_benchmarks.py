@@ -400,7 +400,7 @@ def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(mon
         return (lambda: time.sleep(1e-4)), "C, 8 lanes"
 
     monkeypatch.setattr(benchmarks, "_outputs", outputs)
-    monkeypatch.setattr(benchmarks.crowds, "by_kernel", by_kernel)
+    monkeypatch.setattr(benchmarks.baselines, "by_kernel", by_kernel)
     timings = measure("crowd")
     of_crowd = figures(timings)
     assert of_crowd["heights by C, 8 lanes: leg-frames a second"].value > 0.0

@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from fitting.cli import main
 from fitting.clips import load_clip, save_clip
-from fitting.codegen.blender import SOURCES
 from fitting.experiment.systems import preset_names
 from fitting.ground.meshes import load_terrain, mesh_of
+from fitting.studies.exports import ADDON
 from support.commands import refusal
 from support.experiments import ROOT
 
@@ -36,7 +36,7 @@ TOLERANCE = 1e-4  # m
 @pytest.fixture(scope="module")
 def exchange():
     """The module of the add-on that needs no Blender."""
-    return SimpleNamespace(**runpy.run_path(str(SOURCES / "exchange.py")))
+    return SimpleNamespace(**runpy.run_path(str(ADDON / "exchange.py")))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_the_command_says_what_the_add_on_does_not_take(tmp_path, capsys):
 
 
 def test_the_panel_offers_all_presets():
-    text = (SOURCES / "addon.py").read_text(encoding="utf-8")
+    text = (ADDON / "addon.py").read_text(encoding="utf-8")
     systems = re.search(r"^SYSTEMS = \[(.*?)^\]", text, re.DOTALL | re.MULTILINE)
     assert systems is not None
     offered = re.findall(r'^    \("(.+?)"', systems[1], re.MULTILINE)
@@ -119,7 +119,7 @@ def baked(archive, tmp_path_factory) -> Path:
     np.savez(folder / "ground.npz", vertices=ground.vertices, faces=ground.faces)
     script = Path(__file__).parents[1] / "support" / "blender_addon.py"
     words = [archive, folder / "walk.bvh", folder / "ground.npz", sys.executable, folder]
-    environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / "user")}
+    environment = os.environ | {"BLENDER_USER_READDON": str(folder / "user")}
     command = [python, str(script), *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
     assert not done.returncode, done.stdout[-2000:] + done.stderr[-2000:]

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from fitting.clips.clip import FASTEST, SLOWEST, Recording, local_from_world
-from fitting.clips.model import Model
+from fitting.clips.clip import FASTEST, SLOWEST, Model, Recording, local_from_world
 from fitting.runtime.validation import error_context
 
 from .gltf_document import (

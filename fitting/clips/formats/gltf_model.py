@@ -9,8 +9,7 @@ from urllib.parse import unquote
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from fitting.clips.clip import Clip
-from fitting.clips.model import Model
+from fitting.clips.clip import Clip, Model
 
 from .gltf_document import DATA, Document
 

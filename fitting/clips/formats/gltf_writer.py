@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from fitting.clips.clip import Clip, continuous, local_from_world, world_from_local
-from fitting.clips.model import Model
+from fitting.clips.clip import Clip, Model, continuous, local_from_world, world_from_local
 from fitting.clips.rigs import rotation, unit
 
 from .gltf_model import GENERATOR
