@@ -88,7 +88,7 @@ def viewed(run: Path) -> ViewedClip:
 def page(clip: ViewedClip, folder: Path) -> Path:
     """A page of a report that shows nothing but a clip."""
     Document(
-        file="walk.md", kind="", title="walk", verdict="", good=True, findings=(), sections=(),
+        file="walk.txt", kind="", title="walk", verdict="", good=True, findings=(), sections=(),
         setup=(), view=View([clip], ["walk"], "2 cm"),
     ).write(folder)  # fmt: skip
     return folder / pages.PAGE
