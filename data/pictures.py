@@ -89,7 +89,7 @@ def page(clip: ViewedClip, folder: Path) -> Path:
     """A page of a report that shows nothing but a clip."""
     Document(
         file="walk.txt", kind="", title="walk", verdict="", good=True, findings=(), sections=(),
-        setup=(), view=View([clip], ["walk"], "2 cm"),
+        setup=[], view=View([clip], ["walk"], "2 cm"),
     ).write(folder)  # fmt: skip
     return folder / pages.PAGE
 
