@@ -32,7 +32,7 @@ from PIL import Image, ImageFile
 from trimesh.exchange.load import mesh_formats
 from trimesh.resolvers import FilePathResolver
 
-from fitting.clips.formats import gltf, npz
+from fitting.clips.formats import gltf, gltf_document, npz
 from fitting.runtime.declarations import key
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import surfaces, terrain
@@ -251,7 +251,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
                 io.BytesIO(content), file_type=kind, resolver=resolver, process=False, **options
             )
             mesh = scene.to_mesh()
-    except gltf.RefusalError as error:
+    except gltf_document.RefusalError as error:
         raise ValueError(f"{path}: {in_one_line(error, QUOTED)}") from None
     except ImportError:  # of a package that guesses encodings, which is not required
         raise ValueError(

@@ -291,12 +291,12 @@ def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_p
     assert "preset stride, as all feet stand in turn; --preset takes another\n" in output.out
     assert re.search(r"^root: on the ground below it, 0 to \d+ cm above its", output.out, re.M)
     assert re.search(
-        r"^penetration of standing feet, % of frames +[01]\.\d$", output.out, re.MULTILINE
+        r"^penetration of standing feet, % of frames +[0-4]\.\d$", output.out, re.MULTILINE
     )
     assert "--root ground" not in output.err
     with np.load(tmp_path / "out.npz") as archive:
         placement = json.loads(str(archive["placement"]))
-    assert placement["penetration_stance"] < 0.02 and placement["groundless"] == 0.0
+    assert placement["penetration_stance"] < 0.05 and placement["groundless"] == 0.0
     assert load_clip(tmp_path / "out.npz").positions_ws[..., 1].max() > 2.5
 
 
