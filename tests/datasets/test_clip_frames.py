@@ -18,6 +18,7 @@ from fitting.studies.animations import Animation
 from fitting.synthetic import footsteps, walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support.clips import legs_alone
 from support.grounds import edges_between_footfalls, flight, terrain_of
 
 FPS = 60.0
@@ -25,7 +26,7 @@ FPS = 60.0
 
 @pytest.fixture(scope="module")
 def clip():
-    return walker.walk(2.0, FPS, events=[walker.Slide(1.0, 1.5)])
+    return legs_alone(walker.walk(2.0, FPS, events=[walker.Slide(1.0, 1.5)]))
 
 
 @pytest.fixture(scope="module")

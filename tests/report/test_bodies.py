@@ -9,15 +9,7 @@ from fitting.clips import Clip
 from fitting.clips.assemble import JointMotion, clip_from_joints
 from fitting.report import bodies
 from fitting.synthetic import multi_limb, walker
-
-
-def only(clip: Clip, joints: int) -> Clip:
-    """The first joints of a clip."""
-    motion = JointMotion(
-        clip.joint_names[:joints], clip.parents[:joints], clip.positions_ws[:, :joints],
-        clip.rotations_ws[:, :joints], clip.stance_labels(), clip.fps,
-    )  # fmt: skip
-    return clip_from_joints(motion, clip.source)
+from support.clips import legs_alone
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +36,11 @@ def height(clip: Clip) -> float:
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_a_person_is_as_tall_as_one_and_grows_with_the_legs(person, scale):
-    small = only(replace(person, positions_ws=scale * person.positions_ws), len(walker.JOINTS))
+    motion = JointMotion(
+        person.joint_names, person.parents, scale * person.positions_ws, person.rotations_ws,
+        person.stance_labels(), person.fps,
+    )  # fmt: skip
+    small = clip_from_joints(motion, "small")
     assert 1.65 * scale < height(small) < 1.85 * scale
 
 
@@ -65,7 +61,7 @@ def test_a_person_has_arms_wider_hips_than_waist_and_a_head_on_top(person):
 
 
 def test_legs_alone_have_hips_and_nothing_above_the_pelvis(person):
-    legs = only(person, len(walker.LEGS))
+    legs = legs_alone(person)
     assert height(legs) < 1.15
     assert len(bodies.pack(legs)["limbs"]) == 4 + 2  # hips and what joins them to the pelvis
 

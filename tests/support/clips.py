@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxik
+from fitting.clips.clip import Clip
+from fitting.synthetic import walker
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, pelvis
 from jaxik.world import terrain
@@ -388,3 +390,16 @@ def assert_close(actual: Any, expected: Any, tolerance: float) -> None:
     for (path, b), a in zip(paths, jax.tree.leaves(actual), strict=True):
         name = jax.tree_util.keystr(path)
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=False, err_msg=name)
+
+
+def legs_alone(clip: Clip) -> Clip:
+    """A made walk without what is above its pelvis."""
+    count = len(walker.LEGS)
+    return dataclasses.replace(
+        clip,
+        joint_names=clip.joint_names[:count],
+        parents=clip.parents[:count],
+        offsets_ls=clip.offsets_ls[:count],
+        positions_ws=clip.positions_ws[:, :count],
+        rotations_ws=clip.rotations_ws[:, :count],
+    )
