@@ -38,6 +38,7 @@ from fitting.inference.sample.blocks import SamplerSettings
 from fitting.inference.sample.posterior import WalkerStart, sample_posterior
 from fitting.problem.problem import Problem
 from fitting.runtime import machine
+from fitting.runtime.program_cache import committed
 from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.studies import exports
 from fitting.studies.animations import Animation
@@ -690,7 +691,7 @@ def viewed_walk(frame_count: int) -> Session:
     problem = workloads.problem_from_clips([data])
     frames = problem.data[0].frames
     animation = Animation(base, data.terrain, given_frames=frames, captured=reference)
-    cost = functools.partial(session.cost_of_problem, problem)
+    cost = functools.partial(session.cost_of_problem, committed(problem))
     starts = {session.DEFAULT: problem.space.system}
     clips, preset = (SessionClip("walk", animation),), Preset("record", faithful=True)
     return Session("walk", clips, starts, preset, cost=cost)

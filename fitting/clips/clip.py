@@ -8,7 +8,7 @@ eagerly, it compiles anew for every number of frames: 1.5 s on two cores, agains
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -171,7 +171,16 @@ class Clip:
         if self.measured_rig is None:
             find_roles(self.joint_names, self.parents)  # its error says what is missing
             raise ValueError(f"{self.source} was loaded without legs; {ADVICE}")
-        return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), self.measured_rig)
+        floats = jax.dtypes.canonicalize_dtype(np.float64)
+        if floats not in self._rigs:
+            put = partial(jax.tree.map, lambda leaf: jax.device_put(np.asarray(leaf)))
+            self._rigs[floats] = put(self.measured_rig)
+        return self._rigs[floats]
+
+    @cached_property
+    def _rigs(self) -> dict[np.dtype, Rig]:
+        """By precision; placing its arrays takes a millisecond, and many ask for it."""
+        return {}
 
     @property
     def skeleton(self) -> Skeleton:
@@ -180,7 +189,8 @@ class Clip:
 
     def joints_ws(self, role: int) -> Float64[np.ndarray, "frames legs 3"]:
         """Positions of one joint of each leg, m: `role` is 0 hip, 1 knee, 2 ankle, 3 toe."""
-        return self.positions_ws[:, [joints[role] for joints in self.rig.joints]]
+        rig = self.measured_rig or self.rig  # which says why there is none
+        return self.positions_ws[:, [joints[role] for joints in rig.joints]]
 
     def stance_labels(self) -> Bool[np.ndarray, "frames legs"]:
         """Whether each foot stands: the stored contact labels, or else detected from its motion."""

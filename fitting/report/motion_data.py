@@ -18,7 +18,7 @@ from fitting.clips import Clip
 from fitting.clips.clip import Model
 from fitting.ground.ground_path import GroundPatch
 from fitting.motion import measures
-from fitting.motion.measures import PlacedMotion
+from fitting.motion.measures import PlacedMotion, Soles
 from jaxik.world import body
 
 from . import bodies, live_data, skin_data, style
@@ -45,7 +45,7 @@ class Appearance(NamedTuple):
     """Below 1 it is a shell of glass."""
 
 
-ANIMATED = Appearance(style.SLIDING, 0.8)
+ANIMATED = Appearance(style.SLIDING, 0.9, 0.25)
 BEFORE = Appearance(style.BEFORE, 0.9)
 CAPTURED = Appearance(style.CAPTURED, 1.12, 0.1)  # around what should be inside it
 FITTED = Appearance(style.AFTER)
@@ -140,7 +140,7 @@ def _ground_bytes(ground: GroundPatch) -> int:
 def _motion_bytes(motion: PlacedMotion) -> int:
     frames, legs = motion.in_ground.shape
     turns = 0 if motion.clip.model is None else 8 * len(motion.clip.parents)
-    return 2 * _points(motion).size + frames * (12 + 2 * legs + turns)
+    return 2 * _points(motion.clip, motion.soles).size + frames * (12 + 2 * legs + turns)
 
 
 def _corner(clip: ViewedClip, ground: GroundPatch) -> np.ndarray:
@@ -200,7 +200,7 @@ def _pack_appearance(viewed: ViewedMotion, step: int) -> dict[str, Any]:
 
 def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[str, Any]:
     clip = motion.clip
-    points = _points(motion)[::step]
+    points = _points(motion.clip, motion.soles)[::step]
     root = points[:, clip.rig.pelvis].copy()
     offsets = points - root[:, None]
     quantum = max(float(np.abs(offsets).max()), 1e-6) / LARGEST
@@ -215,7 +215,7 @@ def _pack_motion(motion: PlacedMotion, step: int, corner: np.ndarray) -> dict[st
         "quantum": quantum,
         "root": _base64((root - corner).astype("<f4")),
         "offsets": _base64(np.round(offsets / quantum).astype("<i2")),
-        "gap": _base64(_rounded(_lowest_gaps(motion, step))),
+        "gap": _base64(_rounded(_lowest_gaps(motion.soles, step))),
     }
 
 
@@ -231,10 +231,10 @@ def _pack_skin(
     return turns | ({"skin": skin.content} if key == first else {})
 
 
-def _points(motion: PlacedMotion) -> np.ndarray:
+def _points(clip: Clip, soles: Soles) -> np.ndarray:
     """Joints and, after them, both points of each sole, m: (frames, points, 3)."""
-    soles_ws = motion.soles.points_ws
-    return np.concatenate([motion.clip.positions_ws, soles_ws.reshape(len(soles_ws), -1, 3)], 1)
+    soles_ws = soles.points_ws
+    return np.concatenate([clip.positions_ws, soles_ws.reshape(len(soles_ws), -1, 3)], 1)
 
 
 def _pack_ground(ground: GroundPatch, corner: np.ndarray) -> dict[str, Any]:
@@ -267,28 +267,29 @@ def _travel(pelvis: np.ndarray) -> list[float]:
     return [0.0, 1.0] if distance < 0.2 else (furthest / distance).tolist()
 
 
-def solution(motion: PlacedMotion, shown: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def solution(clip: Clip, soles: Soles, shown: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Another motion of a clip as its page shows one that it has solved: points and gaps, m.
 
     Where the character has a mesh, rotations of its joints are there, too.
 
     Args:
-        motion: over all frames.
+        clip: over all frames.
+        soles: of the clip.
         shown: the clip as the page has it.
     """
     step = shown["step"]
-    points = (_points(motion)[::step] - np.array(shown["corner"])).astype("<f4")
-    arrays = {"points": points, "gap": _lowest_gaps(motion, step).astype("<f4")}
+    points = (_points(clip, soles)[::step] - np.array(shown["corner"])).astype("<f4")
+    arrays = {"points": points, "gap": _lowest_gaps(soles, step).astype("<f4")}
     for skeleton in shown["skeletons"]:
         if "skin" in skeleton:
-            rotations_ws = motion.clip.rotations_ws[::step][:, skeleton["skin"]["joints"]]
+            rotations_ws = clip.rotations_ws[::step][:, skeleton["skin"]["joints"]]
             arrays["turns"] = skin_data.rounded_rotations(rotations_ws)
     return arrays
 
 
-def _lowest_gaps(motion: PlacedMotion, step: int) -> np.ndarray:
+def _lowest_gaps(soles: Soles, step: int) -> np.ndarray:
     """Gaps of every `step`-th frame, m; of those up to the next one the lowest counts."""
-    gap = motion.soles.gap
+    gap = soles.gap
     gap = np.pad(gap, [(0, -len(gap) % step), (0, 0)], constant_values=np.nan)
     return np.fmin.reduce(gap.reshape(-1, step, gap.shape[1]), axis=1)
 

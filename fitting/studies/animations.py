@@ -165,16 +165,22 @@ class Animation:
 
     def run(self, ik: jaxik.FootIK) -> jaxik.Result:
         """The result of a system on the terrain; NumPy arrays."""
+        rig, terrain, frames, tracks = self._inputs
+        result = program_cache.run(ik, rig, terrain, frames, tracks=tracks or None)
         count = len(self.frames.dt)
-        repeats = -count % PADDED  # of the last frame, which change nothing before them
+        return jax.tree.map(lambda x: x[:count], jax.device_get(result))
+
+    @cached_property
+    def _inputs(self) -> tuple[jaxik.Rig, Terrain, jaxik.Frame, dict[str, Array]]:
+        """What does not depend on the system; frames and tracks as long as they are played."""
+        repeats = -len(self.frames.dt) % PADDED  # of the last frame: nothing before them changes
 
         def pad(x: np.ndarray) -> np.ndarray:
             return np.concatenate([x, np.repeat(x[-1:], repeats, axis=0)])
 
-        arrays = jax.device_get((self.frames, dict(self.tracks)))
-        frames, tracks = jax.tree.map(pad, arrays)
-        result = program_cache.run(ik, self.clip.rig, self.terrain, frames, tracks=tracks or None)
-        return jax.tree.map(lambda x: x[:count], jax.device_get(result))
+        padded = jax.tree.map(pad, jax.device_get((self.frames, dict(self.tracks))))
+        arrays = jax.tree.map(jnp.asarray, padded)
+        return program_cache.committed((self.clip.rig, self.terrain, *arrays))
 
     def reached(self, result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
         """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.
@@ -193,7 +199,7 @@ class Animation:
     def bounds(self) -> dict[str, float]:
         """The bounds of its motions, by measure; see `measures.bounds`."""
         animated = self.placed_clip
-        bounds = measures.bounds(animated, self._soles(animated))
+        bounds = measures.bounds(animated, self.soles(animated))
         return (
             bounds
             if self.is_synthetic
@@ -217,7 +223,7 @@ class Animation:
             return None
         animated, files = self.placed_clip, self.files
         unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
-        soles = self._soles(animated)
+        soles = self.soles(animated)
         return measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
 
     def _soles_without(self, cause: measures.Cause) -> measures.Soles | None:
@@ -225,7 +231,7 @@ class Animation:
         try:
             if cause.kind == "root" and self.root.rise is None:
                 _, choice = place_root(self.clip, self.terrain, "ground", self.floor)
-                return self._soles(raised(self.clip, choice.rise))
+                return self.soles(raised(self.clip, choice.rise))
             if cause.kind == "units" and self.files is not None:
                 options = replace(self.files.terrain_options, terrain_scale=cause.amount)
                 terrain = self.files.load_terrain(options)
@@ -242,7 +248,8 @@ class Animation:
         """
         return at_speed(in_direction(self.clip, -self.direction), 1.0 / self.speed)
 
-    def _soles(self, solved: Clip) -> measures.Soles:
+    def soles(self, solved: Clip) -> measures.Soles:
+        """The soles of a motion over the ground."""
         return measures.soles(solved, self.own_speed, self.terrain, self.floor)
 
 

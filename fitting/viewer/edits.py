@@ -62,6 +62,10 @@ class Tuning:
         """All, element by element of each array."""
         return sliders(self.first, self._session.rig, self._session.free)
 
+    @cached_property
+    def _own(self) -> Float64[np.ndarray, " sliders"]:
+        return self.numbers(self.first)
+
     def numbers(self, ik: jaxik.FootIK) -> Float64[np.ndarray, " sliders"]:
         """The values of a system."""
         return np.array([slider.read(ik) for slider in self.sliders], np.float64)
@@ -77,11 +81,11 @@ class Tuning:
             wanted = f"wanted {len(self.sliders)} numbers, one for each slider"
             raise ValueError(f"{wanted}; got {values.size}, {np.isnan(values).sum()} of them NaN")
         arrays: dict[str, np.ndarray] = {}
-        for slider, value in zip(self.sliders, values, strict=True):
-            leaf = slider.leaf
-            if leaf not in arrays:
-                arrays[leaf] = np.array(parameter_tree.get(self.first, leaf))
-            arrays[leaf][slider.index] = value
+        for number in np.flatnonzero(values != self._own):
+            slider = self.sliders[number]
+            if slider.leaf not in arrays:
+                arrays[slider.leaf] = np.array(parameter_tree.get(self.first, slider.leaf))
+            arrays[slider.leaf][slider.index] = values[number]
         return parameter_tree.replace(self.first, arrays)
 
     @in_float64

@@ -183,7 +183,7 @@ def _field(request: Content, name: str, kind: type) -> Any:
 def _packed(solved: Solved, shown: Content) -> bytes:
     """The length of a JSON text, the text, and after it the arrays that it lists."""
     arrays, step, corner = (
-        motion_data.solution(solved.motion, shown),
+        motion_data.solution(solved.clip, solved.soles, shown),
         shown["step"],
         shown["corner"],
     )

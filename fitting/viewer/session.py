@@ -24,7 +24,7 @@ from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.space import FreeParameter, Vector
 from fitting.runtime.precision import in_float64, with_floats
-from fitting.runtime.program_cache import cached
+from fitting.runtime.program_cache import cached, committed
 from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.fit import run_folder
 
@@ -157,7 +157,7 @@ def session_of_fit(
             zip(experiment.clips, clips, scenes, strict=True), 1
         )
     )
-    cost = partial(cost_of_problem, problem)
+    cost = partial(cost_of_problem, committed(problem))
     if experiment.capture:  # then the problem is one of more than a system
         cost = partial(cost_of_scenes, scenes)
     return Session(

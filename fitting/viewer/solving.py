@@ -14,7 +14,7 @@ import jaxik
 from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result
 from fitting.ground import ground_path
-from fitting.motion.measures import PlacedMotion
+from fitting.motion.measures import PlacedMotion, Soles
 from fitting.motion.playback import stage_outputs
 from fitting.report import motion_data
 from fitting.report.motion_data import ViewedClip, ViewedMotion
@@ -55,7 +55,8 @@ class Lines(NamedTuple):
 class Solved:
     """What a system makes of a clip."""
 
-    motion: PlacedMotion
+    clip: Clip
+    soles: Soles
     layers: dict[str, Lines]
     """Those that were wanted."""
     cost: float | None
@@ -97,16 +98,17 @@ class Solver:
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite")
         lines = overlays(result, solved, layers) if layers else {}
-        motion, cost = own.place(solved), None if cost is None else float(cost)
-        return Solved(motion, lines, cost, time.perf_counter() - began)
+        soles, cost = own.soles(solved), None if cost is None else float(cost)
+        return Solved(solved, soles, lines, cost, time.perf_counter() - began)
 
     @in_float64
     def viewed(self) -> ViewedClip:
         """The clip as the page shows it at first: animation, first system, captured motion."""
         own, first = self.animation, next(iter(self.session.starts.values()))
+        solved = own.place(self.solve(first).clip)
         motions = {
             "animated": ViewedMotion("flat animation", self._flat, motion_data.ANIMATED, True),
-            SOLVED: ViewedMotion("solved", self.solve(first).motion, motion_data.FITTED, True),
+            SOLVED: ViewedMotion("solved", solved, motion_data.FITTED, True),
         }
         if own.captured is not None:
             captured = own.place(own.captured)

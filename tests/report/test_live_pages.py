@@ -52,7 +52,7 @@ console.log(JSON.stringify(Array.from(hits)));
 @pytest.fixture(scope="module")
 def live() -> LiveClip:
     """A short walk without systems, on no ground yet."""
-    animation = comparisons.walk(1.1)
+    animation = comparisons.walk(0.1)
     clip = animation.clip
     return LiveClip(clip, animation.frames, clip.rig, animation.terrain, clip.observed, systems={})
 

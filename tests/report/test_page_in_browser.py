@@ -318,7 +318,7 @@ def test_the_page_solves_a_clip_as_jaxik_run_does(open_page, fitted, path):
 @pytest.mark.slow
 def test_a_comparison_solves_the_clip_with_the_system_that_is_watched(open_page, tmp_path):
     systems = comparison.named_systems([("--presets", "record,stride,mec,unreal")])
-    compared = comparison.run_systems(systems, comparisons.walk(2.5))
+    compared = comparison.run_systems(systems, comparisons.walk(1.5))
     comparison.document(compared).write(tmp_path)
     page, (data,) = open_page(path=tmp_path / pages.PAGE), Page(tmp_path / pages.PAGE).data["clips"]
     page.locator("#live > summary").click()

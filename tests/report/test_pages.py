@@ -424,7 +424,7 @@ def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
         "1 of 2 beyond a bound ◐ Worst is deep: "
     )
-    assert "penetration 100.0 % of frames (≤ 5.0), worst 11" in page.text
+    assert "penetration 100.0 % of frames (≤ 5.0), worst 10" in page.text
     assert "close keeps standing feet on the ground best" in page.text
     assert (
         f"Closest to the captured motion is close, whose ankles are 0.0 cm away (rms), furthest "

@@ -221,7 +221,7 @@ def test_a_figure_distinguishes_more_systems_than_there_are_colours():
 
 
 def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
-    compared = comparisons.invented_comparison(comparisons.walk(10.0))
+    compared = comparisons.invented_comparison(comparisons.walk(9.0))
     figure = comparison.overview(compared)
     upper, lower = figure.subfigs
     assert len(upper.axes) == 2 * (2 + 1) and len(lower.axes) == len(MEASURES)

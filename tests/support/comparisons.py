@@ -14,9 +14,11 @@ GROUND = "data/terrains/uneven_walk.ply"
 DEEP = 0.1  # m, by which one of the systems is in the ground
 
 
-def walk(end: float = 1.2) -> Animation:
-    """A captured walk from 1 s to another time, s, whose captured motion is known."""
-    captured, flat = (edit.trim(load_flat_animation(ROOT / name), 1.0, end) for name in WALK)
+def walk(seconds: float = 0.2) -> Animation:
+    """A part of a captured walk, from 2.5 s on, whose captured motion is known."""
+    captured, flat = (
+        edit.trim(load_flat_animation(ROOT / name), 2.5, 2.5 + seconds) for name in WALK
+    )
     return Animation(flat, load_terrain(ROOT / GROUND), captured=captured)
 
 

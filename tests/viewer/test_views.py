@@ -135,11 +135,11 @@ def test_a_run_begins_with_the_motion_and_cost_of_its_fit_with_rays_and_targets(
         name: solver.solve(session.starts[name], list(LAYERS)) for name in ("fitted", "before")
     }
     joints = saved_clips(fitted)["fitted.npz"].positions_ws
-    np.testing.assert_allclose(solved["fitted"].motion.clip.positions_ws, joints, atol=1e-9)
+    np.testing.assert_allclose(solved["fitted"].clip.positions_ws, joints, atol=1e-9)
     for name, shown in solved.items():
         u = fitted.problem.space.pack(session.starts[name])
         assert shown.cost == pytest.approx(float(fitted.problem.cost(u)), rel=1e-9)
-    overlays, motion = solved["fitted"].layers, solved["fitted"].motion
+    overlays, motion = solved["fitted"].layers, solved["fitted"]
     assert list(overlays) == list(LAYERS)
     rays = overlays["rays"].points  # which end on the ground, as targets are where ankles are
     assert np.all(rays[..., 0, 1] >= rays[..., 1, 1])
@@ -157,7 +157,7 @@ def test_any_parameter_moves_the_feet_and_the_cost_and_poses_are_finite_or_refus
     ik = solver.session.starts["fitted"]
     moved = parameter_tree.replace(ik, {"probe.ray_down": 0.0})
     before, after = solver.solve(ik), solver.solve(moved)
-    ankles = [solved.motion.clip.joints_ws(2) for solved in (before, after)]
+    ankles = [solved.clip.joints_ws(2) for solved in (before, after)]
     assert np.abs(ankles[1] - ankles[0]).max() > 0.01 and after.cost != before.cost
 
     def broken(clip, result, **placed):
@@ -175,7 +175,7 @@ def test_a_clip_is_shown_as_jaxik_run_solves_it(fitted, tmp_path):
     assert list(session.starts) == ["default"] and session.cost is None
     shown = Solver(session).solve(session.starts["default"])
     _, solved = load_animation(files).solve(session.starts["default"])
-    np.testing.assert_allclose(shown.motion.clip.positions_ws, solved.positions_ws, atol=1e-9)
+    np.testing.assert_allclose(shown.clip.positions_ws, solved.positions_ws, atol=1e-9)
     assert shown.cost is None
 
 
@@ -269,7 +269,7 @@ def test_the_page_gets_clips_and_motions_and_its_title_is_no_script(served):
     ]  # fmt: skip
     points = np.frombuffer(arrays, "<f4", listed[0][2]).reshape(clip["frames"], -1, 3)
     solver = Solver(served.viewer.session, 1)
-    own = solver.solve(served.viewer.tuning.first).motion.clip.positions_ws
+    own = solver.solve(served.viewer.tuning.first).clip.positions_ws
     joints = own.shape[1]
     np.testing.assert_allclose(points[:, :joints] + clip["corner"], own, atol=1e-5)
 
