@@ -716,7 +716,7 @@ def view(measurement: Measurement, sizes: Sizes) -> None:
         moved, number = own.copy(), next(drags)
         slider = shown.tuning.sliders[number]
         moved[number] = random.uniform(slider.low, slider.high)
-        values = base64.b64encode(moved).decode()
+        values = base64.b64encode(moved.tobytes()).decode()
         shown.solve({"clip": 0, "layers": [], "values": values})
 
     measurement.time_in_turns({"drag": solve})

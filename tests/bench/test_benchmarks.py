@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import Mock
 
 import jax
@@ -507,7 +508,10 @@ def test_a_drag_is_measured_without_its_compilation_and_pages_by_their_size(monk
         starts={DEFAULT: ik}, rig=clip.rig, free=(), clips=[SimpleNamespace(animation=animation)]
     )
     viewer = SimpleNamespace(
-        tuning=Tuning(session), clip=int, solve=requests.append, page=lambda wait: "a" * 2_000_000
+        tuning=Tuning(cast(Any, session)),
+        clip=int,
+        solve=requests.append,
+        page=lambda wait: "a" * 2_000_000,
     )
     monkeypatch.setattr(benchmarks, "viewed_walk", lambda frame_count: session)
     monkeypatch.setattr(benchmarks, "Viewer", lambda session, folder: viewer)
