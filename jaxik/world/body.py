@@ -66,7 +66,8 @@ def pitch_rate(rig: Rig | None, of_people: float) -> Array | float:
     """How far a body pitches with a slope: that of four legs and more lies along it."""
     if rig is None:
         return of_people
-    return jnp.where(jnp.sum(rig.present, axis=-1) > 3, 1.0, of_people)
+    rate = jnp.where(jnp.sum(rig.present, axis=-1) > 3, 1.0, of_people)
+    return rate.astype(float)  # no weak type, with which every program would compile once more
 
 
 def scale(system: Tree, rig: Rig | None) -> Tree:

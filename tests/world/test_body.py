@@ -1,6 +1,7 @@
 """Transforms, skeletons, and bodies of other sizes: their numbers, and similar motion."""
 
 import dataclasses
+import itertools
 from math import inf
 from typing import Any
 
@@ -235,6 +236,13 @@ def test_an_adult_has_the_numbers_of_a_preset_and_ranges_contain_those_of_any_bo
                 default, of_adult = defaults[name], declared[name]
                 if (of_adult.low <= default).all() and (default <= of_adult.high).all():
                     assert (low <= value).all() and (value <= high).all(), (preset, name)
+
+
+def test_no_number_of_a_preset_is_weakly_typed():
+    """Programs would compile once more for the same system from a file."""
+    for preset, rig in itertools.product(PRESETS, (None, make_body())):
+        leaves = jax.tree.leaves(getattr(presets, preset)(rig))
+        assert not any(leaf.weak_type for leaf in leaves), preset
 
 
 def test_heights_of_soles_are_those_of_the_rig_and_over_them_follow_the_length_of_the_foot():
