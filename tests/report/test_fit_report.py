@@ -589,7 +589,8 @@ def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted
     np.testing.assert_array_equal(table[["low95", "high95"]], intervals)
 
 
-def test_a_notebook_shows_the_motion_of_a_fit_and_of_draws_of_a_posterior(tmp_path):
+def test_a_notebook_shows_the_motion_of_a_fit_and_of_draws_of_a_posterior(tmp_path, monkeypatch):
+    monkeypatch.setattr(playback, "measure_activity", lambda *_: [])  # which is not shown
     fitted = runs.with_clips(runs.invented_fit(tmp_path))
     frame = view_of(fitted._repr_html_(), tmp_path)
     labels = [skeleton["label"] for skeleton in frame.data["clips"][0]["skeletons"]]
