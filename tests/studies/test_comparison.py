@@ -158,20 +158,21 @@ def test_a_walk_neither_sinks_nor_floats_on_ground_at_the_height_of_its_floor(fo
 
 
 def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
-    walk = clips.load_clip(folder / "walk.npz")
-    middle = float(np.median(walk.joints_ws(2)[..., 2]))
-    corners = np.array([[-9.0, 0.0, middle], [9.0, 0.0, middle], [0.0, 0.0, middle - 99.0]])
-    triangle = np.array([[0, 1, 2]])
-    systems = {"ozz": preset_system("ozz")}
-    half = comparison.run_systems(
-        systems, Animation(walk, terrain.mesh(corners, triangle)), title="half"
-    )
+    """Beyond the end of the ground of the comparison, for which there is a program."""
+    walk, ground = clips.load_clip(folder / "walk.npz"), meshes.load_terrain(GROUND)
+    systems = {"record": preset_system("record")}
+    end = np.max(meshes.mesh_of(ground).vertices[:, 2]) - np.median(walk.joints_ws(2)[..., 2])
+
+    def compare(shift: float) -> comparison.Comparison:
+        moved = walk.with_motion(walk.positions_ws + [0.0, 0.0, shift], walk.rotations_ws)
+        return comparison.run_systems(systems, Animation(moved, ground))
+
+    half = compare(end)
     assert 0.3 < half.animated.measures.groundless < 0.7
     assert np.isfinite(half.animated.measures.floating_height)
     comparison.document(half).write(tmp_path)
     assert "have no ground under them" in (tmp_path / comparison.TABLE).read_text()
-    none = comparison.run_systems(systems, Animation(walk, terrain.mesh(corners - 999.0, triangle)))
-    comparison.document(none).write(tmp_path)
+    comparison.document(compare(999.0)).write(tmp_path)
     assert numbers(tmp_path)[comparison.ANIMATED]["floating_height"] is None
 
 
