@@ -602,6 +602,7 @@ def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search
     assert np.sqrt(np.mean(error**2)) < 0.04
 
 
+@pytest.mark.slow
 def test_the_blocks_of_subject_03_are_reconstructed_within_a_centimetre(mocap):
     """Compares heights in the middle of each cell of `terrain_subject03.json`.
 
