@@ -165,7 +165,8 @@ def view(options: argparse.Namespace) -> int:
     jaxik view walk.bvh --terrain steps.obj --parameters footik.toml --port 9000
 
     Save on the page writes tuned.toml and, where it has room, the record tuned.bin; files
-    that exist stay. Ctrl-C ends it.
+    that exist stay. On the time line stances are put right by hand; Save contacts writes
+    CLIP.contacts.toml beside the clip. Ctrl-C ends it.
     """
     from fitting import jobs, viewer
     from fitting.experiment.parameter_files import load_system

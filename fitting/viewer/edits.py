@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -219,14 +219,14 @@ def save_contacts(files: Sequence[ClipFile], shown: Clip, legs: Sequence[Sequenc
     part = {
         name: [_stance(each, shown) for each in leg] for name, leg in zip(names, legs, strict=True)
     }
-    sentences = []
+    labelled: dict[Path, Clip] = {}  # all are checked before any is written
     for file in files:
         whole = file.load()
-        path = contacts_path(file.path)
-        labelled = with_stances(whole, _inserted(stances_of(whole), part, shown))
-        save_stances(path, labelled)
-        sentences.append(f"{path}: {count(labelled)}.")
-    return " ".join(sentences)
+        stances = _inserted(stances_of(whole), part, shown)
+        labelled[contacts_path(file.path)] = with_stances(whole, stances)
+    for path, clip in labelled.items():
+        save_stances(path, clip)
+    return " ".join(f"{path}: {count(clip)}." for path, clip in labelled.items())
 
 
 def _stance(content: Content, shown: Clip) -> Stance:
@@ -250,7 +250,7 @@ def _inserted(
     """The stances of a whole clip, those of a part of it exchanged; what a cut parts is joined."""
     frame = 1.0 / shown.fps
     first, last = shown.start, shown.start + (shown.frame_count - 1) * frame
-    joined: dict[str, Any] = {}
+    joined: dict[str, tuple[Stance, ...]] = {}
     for name, stances in whole.items():
         inside = list(part[name])
         before = [each for each in stances if each.start < first - frame / 2]

@@ -76,7 +76,11 @@ class Viewer:
             self._ready.set()
 
     def page(self, *, wait: bool = False) -> str:
-        """The page, with its first clip; until that is solved one that asks again, or none."""
+        """The page, with its first clip.
+
+        Args:
+            wait: until that is solved; otherwise it is a page meanwhile that asks again.
+        """
         session = self.session
         if not self._ready.wait(None if wait else 0.0):
             return pages.render("waiting.html", [], title=session.title)

@@ -18,9 +18,9 @@ function makeStage(canvas) {
 }
 
 function make(name, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(name), properties);
-  made.append(...children);
-  return made;
+  const node = Object.assign(document.createElement(name), properties);
+  node.append(...children);
+  return node;
 }
 
 function swatch({ colour }) {

@@ -22,6 +22,7 @@ class Timeline {
   setClip(clip, watched, contacts) {
     Object.assign(this, { clip, watched, contacts });
     this.row = contacts ? TALL_ROW : ROW;
+    this.svg.setAttribute("role", contacts ? "group" : "img"); // an image has no parts to operate
     this.stance = new Uint8Array(bytesOf(clip.stance));
     this.drawAll();
   }
