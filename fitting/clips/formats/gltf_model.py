@@ -27,7 +27,7 @@ def keep(
 ) -> Model | None:
     """The file of a skeleton, unless it is scaled differently along its axes, or one of ours.
 
-    Our own files show no character, but bones.
+    Our own files show no character, but bones. A file whose other parts are damaged is not kept.
 
     Args:
         document: the file.
@@ -40,10 +40,14 @@ def keep(
     """
     scales = {name: _even_scale(places[node]) for name, node in nodes.items()}
     even = {name: scale for name, scale in scales.items() if scale is not None}
-    is_ours = document.header["asset"].get("generator") == GENERATOR
+    asset = document.header.get("asset")
+    is_ours = isinstance(asset, Mapping) and asset.get("generator") == GENERATOR
     if is_ours or len(even) < len(nodes) or _even_scale(above) is None:
         return None
-    return Model(*_in_one_buffer(document), nodes, even, above)
+    try:
+        return Model(*_in_one_buffer(document), nodes, even, above)
+    except (KeyError, IndexError, TypeError, AttributeError):
+        return None
 
 
 def _even_scale(matrix: Float64[np.ndarray, "4 4"]) -> float | None:
