@@ -300,10 +300,19 @@ def _restored(stored: StoredDocument) -> Document:
                 Section(heading, [_block(*block) for block in blocks], on_page)
                 for heading, blocks, on_page in stored["sections"]
             ],
-            view=None if stored["view"] is None else View(**stored["view"]),
+            view=_restored_view(stored["view"]),
         )
     except (TypeError, KeyError) as error:
         raise ValueError(in_one_line(error)) from None
+
+
+def _restored_view(stored: Content | None) -> View | None:
+    """A view; None for one that another version has packed, which no script can read now."""
+    if stored is None:
+        return None
+    view = View(**stored)
+    is_ours = all(clip.get("format") == motion_data.FORMAT for clip in view.packed)
+    return view if is_ours else None
 
 
 def _block(kind: str, *fields: Any) -> Block:

@@ -32,6 +32,7 @@ LARGEST = 32_767  # of a 16-bit integer
 HOLE = 65_535  # in place of a height, where there is no ground
 TENTH = 1e-4  # m, in steps of which gaps are rounded
 NO_GAP = -32_768  # in place of a gap, where there is no ground below a sole
+FORMAT = 2  # of what is packed, which scripts of another version cannot read
 
 
 class Appearance(NamedTuple):
@@ -163,6 +164,7 @@ def _pack_clip(
             firsts.setdefault(model, key)
     reference = clip.reference.clip
     return {
+        "format": FORMAT,
         "rate": reference.fps / step,
         "frames": len(range(0, reference.frame_count, step)),
         "size": float(body.ratio(reference.rig)),

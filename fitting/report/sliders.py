@@ -38,28 +38,11 @@ class Slider:
     """Whether a fit has changed it."""
 
     @property
-    def stage(self) -> str:
-        """The stage whose rule has it."""
-        return self.leaf.partition(".")[0]
-
-    @property
-    def label(self) -> str:
-        """The name without its stage."""
-        return self.name.partition(".")[2]
-
-    @property
     def step(self) -> float:
         """Of a slider: a round number, in the parameter's unit."""
         raw = (self.high - self.low) / STEPS
         power = 10.0 ** math.floor(math.log10(raw))
         return next(m for m in (5.0, 2.0, 1.0) if m * power <= raw * (1 + 1e-9)) * power
-
-    @property
-    def hint(self) -> str:
-        """What it does, with its unit and range."""
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        limits = "" if self.is_switch else f" {self.low:.4g} to {self.high:.4g}{unit}."
-        return f"{self.name}: {self.meaning}{limits}"
 
     def scaled(self, ratio: float) -> "Slider":
         """That of a system for a dynamically similar body; see `jaxik.world.body.similar`."""

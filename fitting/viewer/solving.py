@@ -3,7 +3,6 @@
 import time
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -14,7 +13,7 @@ import jaxik
 from fitting.clips import Clip
 from fitting.clips.clip_frames import clip_from_result
 from fitting.ground import ground_path
-from fitting.motion.measures import PlacedMotion, Soles
+from fitting.motion.measures import Soles
 from fitting.motion.playback import stage_outputs
 from fitting.report import motion_data
 from fitting.report.motion_data import ViewedClip, ViewedMotion
@@ -105,9 +104,9 @@ class Solver:
     def viewed(self) -> ViewedClip:
         """The clip as the page shows it at first: animation, first system, captured motion."""
         own, first = self.animation, next(iter(self.session.starts.values()))
-        solved = own.place(self.solve(first).clip)
+        flat, solved = own.place(own.placed_clip), own.place(self.solve(first).clip)
         motions = {
-            "animated": ViewedMotion("flat animation", self._flat, motion_data.ANIMATED, True),
+            "animated": ViewedMotion("flat animation", flat, motion_data.ANIMATED, True),
             SOLVED: ViewedMotion("solved", solved, motion_data.FITTED, True),
         }
         if own.captured is not None:
@@ -120,10 +119,6 @@ class Solver:
             ground_path.around_path(own.placed_clip, own.terrain),
             watched=SOLVED,
         )
-
-    @cached_property
-    def _flat(self) -> PlacedMotion:
-        return self.animation.place(self.animation.placed_clip)
 
 
 def overlays(result: jaxik.Result, solved: Clip, names: Collection[str]) -> dict[str, Lines]:

@@ -25,6 +25,7 @@ from fitting.clips import load_clip, save_clip
 from fitting.experiment.systems import preset_names
 from fitting.ground.meshes import load_terrain, mesh_of
 from fitting.studies.exports import ADDON
+from support import blender
 from support.commands import refusal
 from support.experiments import ROOT
 
@@ -107,19 +108,14 @@ def test_a_motion_is_read_by_us_as_it_was_written(exchange, tmp_path):
 @pytest.fixture(scope="module")
 def baked(archive, tmp_path_factory) -> Path:
     """What Blender has done with the add-on."""
-    python = os.environ.get("BLENDER_PYTHON")
-    if python is None:
-        pytest.skip("BLENDER_PYTHON names no Python with Blender as a module (bpy)")
-    ready = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True)
-    if ready.returncode:
-        pytest.skip(f"{python} cannot import bpy: {ready.stderr.strip()[-200:]}")
+    python = blender.python()
     folder = tmp_path_factory.mktemp("blender")
     save_clip(folder / "walk.bvh", load_clip(BASE).select(slice(0, 60)))
     ground = mesh_of(load_terrain(GROUND))
     np.savez(folder / "ground.npz", vertices=ground.vertices, faces=ground.faces)
     script = Path(__file__).parents[1] / "support" / "blender_addon.py"
     words = [archive, folder / "walk.bvh", folder / "ground.npz", sys.executable, folder]
-    environment = os.environ | {"BLENDER_USER_READDON": str(folder / "user")}
+    environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / "user")}
     command = [python, str(script), *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
     assert not done.returncode, done.stdout[-2000:] + done.stderr[-2000:]

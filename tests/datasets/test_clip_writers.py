@@ -27,6 +27,7 @@ from fitting.clips.edit import resample
 from fitting.clips.formats.gltf_writer import bone_mesh
 from fitting.ground.meshes import Mesh, load_terrain, mesh_of
 from jaxik.world import terrain
+from support import blender
 from support.sample_clips import AMC, ASF, BVH, BVH_FILES, stair_walk
 
 TOLERANCE = 1e-4  # m
@@ -273,12 +274,7 @@ def strides() -> Clip:
 @pytest.fixture(scope="module")
 def folder(strides, tmp_path_factory) -> Path:
     """Our files, what Blender exports of them, and where it sees their joints."""
-    python = os.environ.get("BLENDER_PYTHON")
-    if python is None:
-        pytest.skip("BLENDER_PYTHON names no Python with Blender as a module (bpy)")
-    ready = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True)
-    if ready.returncode:
-        pytest.skip(f"{python} cannot import bpy: {ready.stderr.strip()[-200:]}")
+    python = blender.python()
     folder = tmp_path_factory.mktemp("blender")
     files = [str(folder / name) for name in ("walk.bvh", "walk.glb")]
     for file in files:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.motion import measures, playback
+from fitting.motion import accuracy, measures, playback
 from fitting.report import motion_data, pages
 from fitting.studies import comparison
 from fitting.studies.fit import fit_motions
@@ -177,6 +177,19 @@ def test_the_worst_seconds_are_one_click_away(open_page):
     page.locator(".to-worst").click()
     page.wait_for_function("document.getElementById('view').dataset.playing === 'false'")
     assert page.locator("#motion").is_visible()
+
+
+def test_the_table_beside_the_view_has_the_figures_of_the_report(open_page, fitted):
+    page = open_page()
+    row = page.locator("#figures tbody tr", has_text="fitted")
+    shown = [float(cell) for cell in row.locator("td").all_inner_texts()]
+    (clip,), (result,) = fitted.clips, fitted.results
+    motions = fit_motions.clip_motions(clip, result, result)
+    close, placed = accuracy.summarise([motions.errors["fitted"]]), motions.fitted.measures
+    distances = [close.ankle, close.ankle_stance, close.knee, close.pelvis, placed.slide]
+    expected = [100 * distance for distance in distances]
+    assert shown[:4] + shown[5:] == pytest.approx(expected, abs=0.011)
+    assert shown[4] == pytest.approx(100 * placed.penetration, abs=0.051)
 
 
 def test_a_phone_needs_no_sideways_scrolling(open_page, path, comparison_path):

@@ -304,9 +304,13 @@ def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, mon
     assert asked["Noise, m and rad"] == "ankle 0.02, knee 0.03, pelvis 0.02, contact 0.25"
 
 
-def test_a_stored_document_is_written_again_with_more_sections(run, tmp_path):
+def test_a_stored_document_is_written_again_with_more_sections(run, tmp_path, monkeypatch):
     report = document.load(run)
     assert report is not None and document.load(tmp_path) is None
+    monkeypatch.setattr(motion_data, "FORMAT", "another version's")
+    without_view = document.load(run)
+    assert report.view is not None and without_view is not None and without_view.view is None
+    monkeypatch.undo()
     report.write(tmp_path)
     for name in ("summary.md", pages.PAGE):
         assert (tmp_path / name).read_text() == (run / name).read_text(), name
