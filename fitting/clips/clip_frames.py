@@ -1,6 +1,6 @@
 """Conversion between clips and the foot IK pipeline: `Clip` to `Frame`, and `Result` to `Clip`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import jax
@@ -12,7 +12,7 @@ import jaxik
 from jaxik.world.frame import UP, Stride
 
 from . import contacts
-from .clip import Clip, local_from_world
+from .clip import Clip
 from .flight import grounded_track
 from .joint_maps import find_trunk
 from .rigs import rotation
@@ -209,7 +209,7 @@ def clip_from_result(
         world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)
         clip = raised(clip, rise, up_ws)
     body, solved = _world_from_model(world, result.body, result.pose)
-    body_rot, body_pos = rotation(body.rot), np.asarray(body.pos)
+    body_pos = np.asarray(body.pos)
 
     positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
     solved_joints = {
@@ -220,22 +220,24 @@ def clip_from_result(
             joints[::-1], (solved.toe, solved.ankle, solved.knee, solved.hip), strict=True
         )
     }
-    positions_ls, rotations_ls = local_from_world(
-        clip.parents, clip.positions_ws, clip.rotations_ws
-    )
-    on_legs: set[int] = set(solved_joints)
-    for joint, parent in enumerate(clip.parents):
+    on_legs = with_descendants(solved_joints, clip.parents)
+    for joint in on_legs:
         if joint in solved_joints:
             positions_ws[:, joint], rotations_ws[:, joint] = solved_joints[joint]
-        elif parent in on_legs:
-            on_legs.add(joint)
-            parent_rot = rotation(rotations_ws[:, parent])
-            offset_ws = parent_rot.apply(positions_ls[:, joint])
-            positions_ws[:, joint] = positions_ws[:, parent] + offset_ws
-            rotations_ws[:, joint] = _wxyz(parent_rot * rotation(rotations_ls[:, joint]))
         else:
-            positions_ws[:, joint] = body_pos + body_rot.apply(positions_ws[:, joint])
-            rotations_ws[:, joint] = _wxyz(body_rot * rotation(rotations_ws[:, joint]))
+            parent = clip.parents[joint]
+            turn_ws = (
+                rotation(rotations_ws[:, parent]) * rotation(clip.rotations_ws[:, parent]).inv()
+            )
+            offset_ws = clip.positions_ws[:, joint] - clip.positions_ws[:, parent]
+            positions_ws[:, joint] = positions_ws[:, parent] + turn_ws.apply(offset_ws)
+            rotations_ws[:, joint] = _wxyz(turn_ws * rotation(rotations_ws[:, joint]))
+    others = [joint for joint in range(len(clip.parents)) if joint not in on_legs]
+    body_turn = rotation(np.repeat(np.asarray(body.rot), len(others), axis=0))  # frame by frame
+    moved_ws = body_turn.apply(positions_ws[:, others].reshape(-1, 3))
+    positions_ws[:, others] = body_pos[:, None] + moved_ws.reshape(-1, len(others), 3)
+    turned_ws = _wxyz(body_turn * rotation(rotations_ws[:, others]))
+    rotations_ws[:, others] = turned_ws.reshape(-1, len(others), 4)
     trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
     corrections, upright = result.corrections, rotation(world.rot)
     turns = [(joint, corrections.twist, 1.0 / len(trunk.twisted)) for joint in trunk.twisted]
@@ -244,16 +246,16 @@ def clip_from_result(
     for joint, turn_ms, share in turns:
         if joint is not None and turn_ms is not None:
             turn_ws = upright * rotation(turn_ms) ** share * upright.inv()
-            above = with_descendants(joint, clip.parents)
+            above = with_descendants([joint], clip.parents)
             _turn(turn_ws, positions_ws, rotations_ws, above)
     return clip.with_motion(positions_ws, rotations_ws)
 
 
-def with_descendants(joint: int, parents: Sequence[int]) -> list[int]:
-    """A joint and all below it in the tree, itself first."""
-    joints = [joint]
+def with_descendants(roots: Iterable[int], parents: Sequence[int]) -> list[int]:
+    """Joints and all below them in the tree, the joints themselves first."""
+    joints = list(roots)
     for child, parent in enumerate(parents):
-        if parent in joints:
+        if parent in joints and child not in joints:
             joints.append(child)
     return joints
 

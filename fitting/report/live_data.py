@@ -244,7 +244,7 @@ def _trunk(live: LiveClip, program: Script) -> list[Content]:
             "joint": joint,
             "rot": result[f"corrections.{kind}"],
             "part": part,
-            "members": with_descendants(joint, clip.parents),
+            "members": with_descendants([joint], clip.parents),
         }
         for joint, kind, part in turns
         if joint is not None and f"corrections.{kind}" in result

@@ -18,6 +18,7 @@ from fitting.motion.playback import stage_outputs
 from fitting.report import motion_data
 from fitting.report.motion_data import ViewedClip, ViewedMotion
 from fitting.runtime.precision import in_float64
+from fitting.runtime.program_cache import committed
 from jaxik.world import body
 from jaxik.world.body import similar
 from jaxik.world.terrain import Hit
@@ -89,6 +90,7 @@ class Solver:
             ValueError: the poses are not finite.
         """
         began, own = time.perf_counter(), self.animation
+        ik = committed(ik)  # once for both programs
         cost = None if self.session.cost is None else self.session.cost(ik)  # runs meanwhile
         size = self.clip.size
         result = self.animation.run(ik if size is None else similar(ik, size))
