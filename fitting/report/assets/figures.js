@@ -2,6 +2,7 @@
 // and fitting.motion.measures define it, of the frames that the page shows.
 
 const rms = (values) => Math.sqrt(values.reduce((sum, value) => sum + value * value, 0) / values.length);
+const rounded = (value, digits) => value.toFixed(digits).replace(/^-(0\.?0*)$/, "$1"); // never -0.00
 const COLUMNS = [ // title, unit, digits, meaning
   ["ankles", "cm", 2, "Distance from captured ankles, root mean square"],
   ["standing", "cm", 2, "The same while the foot stands"],
@@ -149,7 +150,7 @@ class FigureTable {
       make("th", { scope: "col", title: meaning }, title, make("small", {}, unit)));
     const body = rows.map(([skeleton, cells]) => make("tr", { className: skeleton === watched ? "watched" : "" },
       make("th", { scope: "row" }, swatch(skeleton), skeleton.solution ? `${skeleton.label}, live` : skeleton.label),
-      ...shown(cells.map((cell, column) => make("td", {}, Number.isNaN(cell) ? "–" : cell.toFixed(COLUMNS[column][2])))),
+      ...shown(cells.map((cell, column) => make("td", {}, Number.isNaN(cell) ? "–" : rounded(cell, COLUMNS[column][2])))),
     ));
     element("figures").replaceChildren(
       make("thead", {}, make("tr", {}, make("th", { scope: "col" }, "Motion"), ...head)), make("tbody", {}, ...body));
