@@ -22,6 +22,7 @@ from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import share_world
 from fitting.problem.space import free_parameter, make_space
+from fitting.runtime import program_cache
 from fitting.runtime.precision import with_floats
 from fitting.synthetic import terrain_meshes, walker
 from fitting.synthetic.walker import Slide, Slip
@@ -294,7 +295,7 @@ def recording(
     truth = parameter_tree.replace(jaxik.presets.record(faithful=True), TRUTH)
     uneven = terrain.mesh(mesh.vertices, mesh.faces)
     solved = clip_frames.clip_from_result(
-        base, jaxik.run(truth, base.rig, uneven, clip_frames.frames_from_clip(base))
+        base, program_cache.run(truth, base.rig, uneven, clip_frames.frames_from_clip(base))
     )
     reference = solved.with_motion(
         solved.positions_ws + random.normal(0.0, POSITION_NOISE, solved.positions_ws.shape),
