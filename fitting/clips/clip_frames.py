@@ -209,7 +209,6 @@ def clip_from_result(
         world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)
         clip = raised(clip, rise, up_ws)
     body, solved = _world_from_model(world, result.body, result.pose)
-    body_pos = np.asarray(body.pos)
 
     positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
     solved_joints = {
@@ -233,11 +232,8 @@ def clip_from_result(
             positions_ws[:, joint] = positions_ws[:, parent] + turn_ws.apply(offset_ws)
             rotations_ws[:, joint] = _wxyz(turn_ws * rotation(rotations_ws[:, joint]))
     others = [joint for joint in range(len(clip.parents)) if joint not in on_legs]
-    body_turn = rotation(np.repeat(np.asarray(body.rot), len(others), axis=0))  # frame by frame
-    moved_ws = body_turn.apply(positions_ws[:, others].reshape(-1, 3))
-    positions_ws[:, others] = body_pos[:, None] + moved_ws.reshape(-1, len(others), 3)
-    turned_ws = _wxyz(body_turn * rotation(rotations_ws[:, others]))
-    rotations_ws[:, others] = turned_ws.reshape(-1, len(others), 4)
+    _turn(rotation(body.rot), positions_ws, rotations_ws, others, np.zeros_like(body.pos))
+    positions_ws[:, others] += np.asarray(body.pos)[:, None]
     trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
     corrections, upright = result.corrections, rotation(world.rot)
     turns = [(joint, corrections.twist, 1.0 / len(trunk.twisted)) for joint in trunk.twisted]
@@ -247,7 +243,7 @@ def clip_from_result(
         if joint is not None and turn_ms is not None:
             turn_ws = upright * rotation(turn_ms) ** share * upright.inv()
             above = with_descendants([joint], clip.parents)
-            _turn(turn_ws, positions_ws, rotations_ws, above)
+            _turn(turn_ws, positions_ws, rotations_ws, above, positions_ws[:, joint])
     return clip.with_motion(positions_ws, rotations_ws)
 
 
@@ -261,13 +257,20 @@ def with_descendants(roots: Iterable[int], parents: Sequence[int]) -> list[int]:
 
 
 def _turn(
-    turn_ws: Rotation, positions_ws: np.ndarray, rotations_ws: np.ndarray, joints: Sequence[int]
+    turn_ws: Rotation,
+    positions_ws: np.ndarray,
+    rotations_ws: np.ndarray,
+    joints: Sequence[int],
+    pivot_ws: Float64[np.ndarray, "frames 3"],
 ) -> None:
-    """Turns these joints about the first of them, in place."""
-    pivot = positions_ws[:, joints[0]].copy()
-    for joint in joints:
-        positions_ws[:, joint] = pivot + turn_ws.apply(positions_ws[:, joint] - pivot)
-        rotations_ws[:, joint] = _wxyz(turn_ws * rotation(rotations_ws[:, joint]))
+    """Turns these joints about a point, in place, as one body in each frame."""
+    turns = Rotation.from_quat(np.repeat(turn_ws.as_quat(), len(joints), axis=0))
+    arms = positions_ws[:, joints] - pivot_ws[:, None]
+    positions_ws[:, joints] = pivot_ws[:, None] + turns.apply(arms.reshape(-1, 3)).reshape(
+        arms.shape
+    )
+    turned = _wxyz(turns * rotation(rotations_ws[:, joints]))
+    rotations_ws[:, joints] = turned.reshape(*arms.shape[:2], 4)
 
 
 def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:

@@ -81,7 +81,7 @@ class Curves {
     const { values } = this.series.at(-1);
     PANELS.forEach(({ title, unit, digits }, number) => {
       const names = values[number].length > 1 ? clip.legs : [""];
-      const texts = values[number].map((line, leg) => `${names[leg]} ${Number.isFinite(line[frame]) ? line[frame].toFixed(digits) : "–"}`.trim());
+      const texts = values[number].map((line, leg) => `${names[leg]} ${Number.isFinite(line[frame]) ? rounded(line[frame], digits) : "–"}`.trim());
       this.readouts[number].textContent = `${title}: ${texts.join(", ")} ${unit}`;
     });
   }
