@@ -9,6 +9,7 @@ goes from 0 to 1 with something else than time follows `smoothstep`.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -32,12 +33,14 @@ def lerp(value: Array, goal: Array, fraction: Array) -> Array:
     return value + fraction * (goal - value)
 
 
+@jax.jit
 def smoothstep(x: Array) -> Array:
     """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
     x = clip_to_one(x)
     return x * x * (3.0 - 2.0 * x)
 
 
+@jax.jit
 def clip_to_one(x: Array) -> Array:
     """`x` limited to 0..1, with zero gradient outside."""
     return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))

@@ -26,7 +26,7 @@ def unstack(v: Shaped[Array, "*b n"]) -> tuple[Array, ...]:
     """The entries of the last axis, each of shape `*b`."""
     # Split, not sliced: the reverse of a slice is a padded array, and all of them are summed.
     parts = jax.lax.split(v, (1,) * v.shape[-1], axis=v.ndim - 1)
-    return tuple(jnp.squeeze(part, -1) for part in parts)
+    return tuple(jax.lax.squeeze(part, (v.ndim - 1,)) for part in parts)
 
 
 def components(v: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
@@ -122,6 +122,7 @@ def scale(v: Float[Array, "*b 3"], factor: Array) -> Float[Array, "*c 3"]:
     return barrier(stack(*(x * factor for x in components(v))))
 
 
+@jax.jit
 def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Square root; 0 with zero gradient where `x` is 0 or negative."""
     positive = x > 0
@@ -130,6 +131,7 @@ def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, least)), 0.0)
 
 
+@jax.jit
 def safe_divide(
     numerator: Float[Array, "*a"], denominator: Float[Array, "*b"], otherwise: float = 0.0
 ) -> Array:
@@ -168,6 +170,7 @@ def _polynomial(x: Array, coefficients: Sequence[float]) -> Array:
 
 
 @jax.custom_jvp
+@jax.jit
 def _arctan2(y: Array, x: Array) -> Array:
     # A CPU would call the C library for each arctangent, one number at a time.
     rise, run = jnp.abs(y), jnp.abs(x)
@@ -189,6 +192,7 @@ def _arctan2_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
+@jax.jit
 def cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine and sine of an angle, rad, by Taylor's series.
 
