@@ -587,6 +587,7 @@ CAUSES = {
     "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
     "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
+    "limit": "the system refuses the ground: {3} is {4}, and feet stand on it with {5}",
     "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
 }
 
@@ -597,12 +598,14 @@ class Cause(NamedTuple):
     kind: str
     amount: float = 0.0
     """`offset`: m. `units`: metres for each unit of the terrain."""
+    limit: tuple[str, str, str] = ("", "", "")
+    """`limit`: the parameter, its value, and one with which feet stand."""
 
     @property
     def words(self) -> str:
         """The cause, and its remedy."""
         side = "high" if self.amount > 0 else "low"
-        return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side)
+        return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side, *self.limit)
 
 
 Trial = Callable[[Cause], Soles | None]
@@ -620,7 +623,7 @@ def likely_cause(
     - `units`: the feet follow the ground by the factor of a unit of length.
     - `offset`: all feet are too high or too low by the same amount.
     - `root`: the higher the ground, the deeper they are in it.
-    - `unknown`: none of these.
+    - `unknown`: none of these; `limit`, a cause in the system, is for those who know that to find.
 
     Args:
         feet: the soles of the animation.
@@ -630,18 +633,15 @@ def likely_cause(
     """
     visible = VISIBLE * body.ratio(animated.rig)
     standing = feet.stance & ~np.isnan(feet.gap)
-    if standing.sum() < ENOUGH * feet.stance.sum():
+    if not has_ground(feet):
         return Cause("missing")
     gap, ground = feet.gap[standing], np.fmax.reduce(feet.ground, axis=-1)[standing]
 
     def helps(cause: Cause) -> bool:
         if trial is None:
             return True
-        if (remedied := trial(cause)) is None:
-            return False
-        gaps = np.abs(remedied.gap[feet.stance & ~np.isnan(remedied.gap)])
-        covered = len(gaps) >= ENOUGH * feet.stance.sum()
-        return covered and bool(gaps.mean() <= HELPED * np.abs(gap).mean())
+        remedied = trial(cause)
+        return remedied is not None and is_much_closer(remedied, feet)
 
     if np.std(gap) <= CONSTANT * abs(np.mean(gap)) and abs(np.mean(gap)) > visible:
         return Cause("offset", float(np.mean(gap)))
@@ -655,6 +655,21 @@ def likely_cause(
         if _correlation(gap, ground) < -CORRELATED and helps(Cause("root")):
             return Cause("root")
     return Cause("unknown")
+
+
+def has_ground(feet: Soles) -> bool:
+    """Whether there is ground under enough standing feet."""
+    known = feet.stance & ~np.isnan(feet.gap)
+    return bool(known.sum() >= ENOUGH * feet.stance.sum())
+
+
+def is_much_closer(feet: Soles, before: Soles) -> bool:
+    """Whether standing feet have ground, and half of the gaps to it that they had, or less."""
+
+    def mean_gap(soles: Soles) -> float:
+        return _mean(np.abs(soles.gap), soles.stance & ~np.isnan(soles.gap))
+
+    return has_ground(feet) and mean_gap(feet) <= HELPED * mean_gap(before)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

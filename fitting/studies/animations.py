@@ -48,6 +48,7 @@ from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, quat, vec
+from jaxik.stages.probe.limits import AbstractLimitedProbe
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
 
@@ -56,6 +57,9 @@ from .fit import run_folder
 # Frames: clips are played in a multiple of it, as each length is a program of its own, which takes
 # seconds to compile; a frame takes microseconds.
 PADDED = 128
+# Of ground that a probe accepts; `_binding_limit` tries each with these multiples, the least first.
+LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
+RAISED = (1.25, 1.5, 2.0, 3.0)
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
 
@@ -217,14 +221,44 @@ class Animation:
         own = self.own_speed
         return measures.place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
 
-    def cause(self, motion: measures.PlacedMotion) -> measures.Cause | None:
-        """Why the feet of a motion are off their ground; None where they are not."""
+    def cause(
+        self, motion: measures.PlacedMotion, ik: jaxik.FootIK | None = None
+    ) -> measures.Cause | None:
+        """Why the feet of a motion are off their ground; None where they are not.
+
+        Args:
+            motion: on this terrain.
+            ik: the system that made it, if one did.
+        """
         if not motion.measures.misplaced:
             return None
         animated, files = self.placed_clip, self.files
         unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
         soles = self.soles(animated)
-        return measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+        cause = measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+        if cause.kind == "unknown" and ik is not None:
+            return self._binding_limit(motion, ik) or cause
+        return cause
+
+    def _binding_limit(
+        self, motion: measures.PlacedMotion, ik: jaxik.FootIK
+    ) -> measures.Cause | None:
+        """The limit of a system that refuses ground on which feet would stand, if one does."""
+        if not (isinstance(ik.probe, AbstractLimitedProbe) and ik.probe.limited):
+            return None
+        for name in LIMITS_OF_GROUND:
+            for factor in RAISED:  # the same program with another number
+                raised_ik = parameter_tree.replace(
+                    ik, {name: factor * parameter_tree.get(ik, name)}
+                )
+                try:
+                    solved = self.solve(raised_ik)[1]
+                except ValueError:  # poses that are not finite
+                    continue
+                if measures.is_much_closer(self.soles(solved), motion.soles):
+                    refusing, accepting = (parameter_tree.shown(x, name) for x in (ik, raised_ik))
+                    return measures.Cause("limit", limit=(name, refusing, accepting))
+        return None
 
     def _soles_without(self, cause: measures.Cause) -> measures.Soles | None:
         """The soles of the animation after the remedy for a cause; None where there is none."""
@@ -549,7 +583,7 @@ def solve(
     seconds = time.perf_counter() - began
     with activity.announced("Measuring how the feet are placed"):
         motion = loaded.place(solved, result)
-        cause = loaded.cause(motion)
+        cause = loaded.cause(motion, ik)
     if path is not None:
         joints = arrays(motion, loaded.clip)
         ground = mesh_of(loaded.terrain) if with_terrain else None

@@ -255,7 +255,7 @@ def run_systems(
     with activity.announced("Measuring the motions"):
         motions = {ANIMATED: animation.place(animation.placed_clip)}
         motions |= {name: animation.place(clip, result) for name, (result, clip) in solved.items()}
-        causes = {name: animation.cause(motions[name]) for name in solved}
+        causes = {name: animation.cause(motions[name], systems[name]) for name in solved}
     solved_by = {name: systems[name] for name in solved}
     return Comparison(title, animation, motions, causes, failures, solved_by=solved_by)
 

@@ -490,7 +490,7 @@ def test_a_cause_of_misplaced_feet_is_named_only_where_its_remedy_helps(route, t
         animation = load_animation(files)
         cause = animation.cause(animation.place(animation.placed_clip))
         assert cause is not None
-        return cause
+        return cause[:2]
 
     corners = [[-5.0, -11.5, -3.0], [-5.0, -11.5, 12.0], [5.0, 12.5, 12.0], [5.0, 12.5, -3.0]]
     save_mesh(tmp_path / "across.obj", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))

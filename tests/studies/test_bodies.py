@@ -207,6 +207,29 @@ def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
     assert cause is not None and cause.kind == "root"
 
 
+def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_a_floor):
+    walk = edit.trim(on_a_floor, 0.0, 4.0)
+    steps = terrain_of(flight(edges_between_footfalls(walk, 4)[:2], rise=0.45))
+    clip, root = place_root(walk, steps, "ground")
+    animation = Animation(clip, steps, root=root)
+    low = parameter_tree.replace(presets.record(clip.rig), {"probe.max_step_up": 0.1})
+
+    def play(ik: jaxik.FootIK) -> measures.PlacedMotion:
+        result, solved = animation.solve(ik)
+        return animation.place(solved, result)
+
+    refused = play(low)
+    cause = animation.cause(refused, low)
+    assert cause is not None and cause.kind == "limit"
+    name, limit, accepted = cause.limit
+    assert (name, limit) == ("probe.max_step_up", "0.1 m")
+    assert f"{name} is {limit}, and feet stand on it with {accepted}" in cause.words
+    raised = play(parameter_tree.replace(low, {name: float(accepted.removesuffix(" m"))}))
+    assert raised.measures.contact > refused.measures.contact + 0.1
+    without_system = animation.cause(refused)
+    assert without_system is not None and without_system.kind == "unknown"
+
+
 def test_a_system_with_a_root_rule_of_its_own_leaves_a_placed_root_alone(walk, monkeypatch):
     ground = terrain.plane(point=(0.0, 1.0, 0.0))
     clip, root = place_root(walk, ground, "ground")
