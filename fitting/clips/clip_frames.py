@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float64
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from jaxik.world.frame import UP, Stride
+from jaxik.world.frame import FORWARD, UP, Stride
 
 from . import contacts
 from .clip import Clip
@@ -57,6 +57,7 @@ def frames_from_clip(
     ankles, balls = (
         _turned(clip.joints_ws(index), root_ws, up_ws, orientation or 0.0) for index in (2, 3)
     )
+    ahead = _feet_ahead(clip, up_ws, orientation or 0.0)
     moved = _scaled_strides(root_ws, balls, up_ws, stride_scale)
     root_velocity, ankle_velocity, toe_velocity = (
         np.concatenate([_velocity(positions[piece], clip.fps) for piece in clip.pieces])
@@ -72,7 +73,7 @@ def frames_from_clip(
         return None if value is None else array(np.full(clip.frame_count, float(value)))
 
     labels = clip.stance_labels()
-    strides = [_stride(labels[at], (balls + moved)[at], up_ws) for at in clip.pieces]
+    strides = [_stride(labels[at], (balls + moved)[at], ahead[at], up_ws) for at in clip.pieces]
     none = jaxik.Transform(*(array(np.zeros((clip.frame_count, 0, size))) for size in (3, 4)))
     frames = jaxik.Frame(
         world_from_model=world,
@@ -144,6 +145,18 @@ def _turned(
     return root_ws[:, None] + turn.apply(arms.reshape(-1, 3)).reshape(arms.shape)
 
 
+def _feet_ahead(clip: Clip, up_ws: Direction, angle: float) -> Float64[np.ndarray, "frames legs 3"]:
+    """Where the feet point, unit, turned about `up_ws` by an angle, rad."""
+    ankles = np.array(clip.rig.joints)[:, 2]
+    turn = Rotation.from_rotvec(angle * np.asarray(up_ws, np.float64))
+    axes = rotation(np.asarray(clip.rig.ankle_from_foot, np.float64)).apply(FORWARD)
+    feet = [
+        (turn * rotation(clip.rotations_ws[:, ankle])).apply(axis)
+        for ankle, axis in zip(ankles, axes, strict=True)
+    ]
+    return np.stack(feet, axis=1)
+
+
 def _scaled_strides(
     root_ws: np.ndarray, balls_ws: np.ndarray, up_ws: Direction, scale: float | None
 ) -> Float64[np.ndarray, "frames legs 3"] | float:
@@ -158,6 +171,7 @@ def _scaled_strides(
 def _stride(
     stance: Bool[np.ndarray, "frames legs"],
     balls: Float64[np.ndarray, "frames legs 3"],
+    ahead: Float64[np.ndarray, "frames legs 3"],
     up_ws: Direction,
 ) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; unknown where a foot will not stand any more.
@@ -165,7 +179,7 @@ def _stride(
     A swing that the end cuts off goes as far as a whole one before it, and takes as long.
     """
     known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
-    last_ws, next_ws, aside_ws = (np.zeros(balls.shape) for _ in range(3))
+    last_ws, next_ws, aside_ws, last_ahead, next_ahead = (np.zeros(balls.shape) for _ in range(5))
     fraction = np.zeros(stance.shape)
     for leg in map(int, np.flatnonzero(stance.any(axis=0))):
         falls = contacts.footfalls(balls[:, leg], stance[:, leg], up_ws)
@@ -173,13 +187,16 @@ def _stride(
         next_ws[:, leg] = falls.positions_ws[falls.next]
         fraction[:, leg] = falls.swing_fraction
         aside_ws[:, leg] = falls.aside_ws[falls.last]
+        spans = contacts.runs(stance[:, leg])
+        ways = np.array([ahead[first : last + 1, leg].mean(axis=0) for first, last in spans])
+        last_ahead[:, leg], next_ahead[:, leg] = ways[falls.last], ways[falls.next]
         backward = contacts.cut_off_swing(balls[::-1], stance[::-1], leg, up_ws)
         if backward is not None:
-            landed = contacts.runs(stance[:, leg])[-1][0]
+            landed = spans[-1][0]
             next_ws[landed:, leg] = backward.last_ws
             fraction[-len(backward.fraction) :, leg] = 1.0 - backward.fraction[::-1]
             known[:, leg] = True
-    return stance, last_ws, next_ws, fraction, known, aside_ws
+    return stance, last_ws, next_ws, fraction, known, aside_ws, last_ahead, next_ahead
 
 
 def clip_from_result(

@@ -41,6 +41,11 @@ class Stride:
     """m, by how far the middle of a swing is beside the straight way to the next foothold: round a
     corner of the ground, or round the other foot. An offset: it is the same wherever the world's
     origin is. None is 0."""
+    last_ahead_ws: Float[Array, "*b legs 3"] | None = None
+    """Where the foot points at its last foothold; any length. Its sole is supported there as it
+    stood, however the foot turns or swings since. Zero, and None, is where it points now."""
+    next_ahead_ws: Float[Array, "*b legs 3"] | None = None
+    """Where it will point at its next foothold; as for the last."""
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":

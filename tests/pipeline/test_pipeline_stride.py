@@ -90,6 +90,7 @@ def clip(*unlike: str) -> list[characters.Frame]:
     way: dict[str, Any] = {"start": (-0.5, 0.03, -3.7), "heading": 0.12, "speed": 0.8}
     frames = walk(RIG, FRAMES, hz=HZ, known="unknown" not in unlike, **way)
     aside = np.outer(RIG.side, [0.12, 0.03, 0.05])  # also upward, which does not count
+    ahead = np.array([[0.6, 0.3, 1.2], [0.0, 0.0, 0.0]])  # the other is not known
     changed = []
     for index, frame in enumerate(frames):
         fraction, time, before = index / FRAMES, index / HZ, max(index - 1, 0) / HZ
@@ -114,6 +115,7 @@ def clip(*unlike: str) -> list[characters.Frame]:
         root = maths.Transform(slip, maths.multiply(frame.world_from_model.rot, turned))
         rots = np.array([maths.multiply(wobble, rot) for rot in frame.ankle.rot])
         changes: dict[str, Any] = {"known": known, "standing": standing, "aside_ws": aside}
+        changes |= {"last_ahead_ws": ahead, "next_ahead_ws": np.flip(ahead, axis=0)}
         changed.append(
             dataclasses.replace(
                 frame,

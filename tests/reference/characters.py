@@ -93,7 +93,8 @@ class Stride:
     last stood and will stand next; while it stands, `last_ws` is its present position. `fraction`
     (legs) is the part of the swing's time that has passed, 0 while standing. Where `known` (legs)
     is 0, only `standing` is valid. `aside_ws` (legs 3), m, is how far the middle of the swing is
-    beside the straight way; None is 0.
+    beside the straight way; None is 0. `last_ahead_ws` and `next_ahead_ws` (legs 3) are where feet
+    point at their footholds; None, or what points along up, is where they point now.
     """
 
     standing: Array
@@ -102,6 +103,8 @@ class Stride:
     fraction: Array
     known: Array
     aside_ws: Array | None = None
+    last_ahead_ws: Array | None = None
+    next_ahead_ws: Array | None = None
 
 
 @dataclass

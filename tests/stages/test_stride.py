@@ -32,6 +32,7 @@ from support.strides import blocks, walk
 # As many triangles as the uneven blocks: both share a program.
 FLAT = to_terrain(blocks(np.random.default_rng(0), max_height=0.0, tilt=0.0, irregular=False))
 START = (0.0, 0.0, -2.0)
+WAYS = ("aside_ws", "last_ahead_ws", "next_ahead_ws")  # of strides, which may be None
 
 
 # Flat floor.
@@ -60,10 +61,10 @@ def test_nothing_changes_on_a_flat_floor(known: bool):
 
 
 def sensed_ground(ik: jaxik.FootIK, ground: PlainTerrain, frames: jaxik.Frame) -> GroundHits:
-    """What the probe finds; strides that go straight say so, to share a program with the others."""
-    stride = frames.stride
-    if stride.aside_ws is None:
-        stride = dataclasses.replace(stride, aside_ws=jnp.zeros_like(stride.last_ws))
+    """What the probe finds; strides that leave ways out say so, to share a program with others."""
+    missing = [name for name in WAYS if getattr(frames.stride, name) is None]
+    zeros = dict.fromkeys(missing, jnp.zeros_like(frames.stride.last_ws))
+    stride = dataclasses.replace(frames.stride, **zeros)
     return ground_under(ik, to_terrain(ground), dataclasses.replace(frames, stride=stride))
 
 
@@ -249,6 +250,31 @@ def test_a_heel_over_a_drop_slides_onto_the_block_of_its_ball():
     assert (after[lacking] > before[lacking] + 0.1).all()
     # Points lie along the sole in tenths, so that the shares of both differ by a point at most.
     assert np.abs(support - after)[on_block].max() < 0.12
+
+
+def test_a_standing_foot_that_turns_over_an_edge_keeps_its_place():
+    """It turns on its ball by up to 50 degrees to either side, its heel over a drop."""
+    frames = swing(np.zeros(801), 0.02, 0.02)
+    turns = [maths.from_axis_angle(maths.Y, angle) for angle in np.linspace(-0.9, 0.9, 801)]
+    pose, turn = frames.pose, jnp.asarray(turns)[:, None]
+    arm = quat.rotate(turn, pose.ankle.pos - pose.toe.pos)
+    ankle = jaxik.Transform(pose.toe.pos + arm, quat.multiply(turn, pose.ankle.rot))
+    frames = dataclasses.replace(frames, pose=dataclasses.replace(pose, ankle=ankle))
+
+    def moved(**headings: Any) -> np.ndarray:
+        """How the left foot slides, m, level (frames 2)."""
+        stride = dataclasses.replace(frames.stride, **headings)
+        turned = dataclasses.replace(frames, stride=stride)
+        hits = sensed_ground(to_ik({}, "stride"), DROP_BEHIND, turned)
+        return np.asarray(hits.ankle.point - frames.world_from_model.pos[:, None] - ankle.pos)[
+            :, 0, ::2
+        ]
+
+    stood = jnp.broadcast_to(jnp.array([0.0, 0.1, 2.0]), (801, 2, 3))  # neither level nor unit
+    slid = moved(last_ahead_ws=stood, next_ahead_ws=stood)
+    assert_close(slid - slid[0], 0.0, 1e-12)
+    assert abs(slid[0, 1]) > 0.02 and slid[0, 0] == pytest.approx(0.0, abs=1e-12)
+    assert np.abs(np.diff(moved(), axis=0)).max() > 0.02, "judged by where it points now, it jumps"
 
 
 def test_a_heel_in_a_wall_slides_out_of_it_or_the_ball_onto_it():

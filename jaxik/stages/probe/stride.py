@@ -171,7 +171,13 @@ class StrideProbe(AbstractSupportedProbe):
         sure = jnp.where(planted, 1.0, foresight.sureness(swings.fraction))
         tread = Tread(plan.height - origin, jnp.where(swings_on, STAYS * sure, 0.0))
         supports = self.better_support(
-            inputs, level, place_ws[None], feet.foot_height, jnp.ones_like(sure), tread
+            inputs,
+            level,
+            place_ws[None],
+            feet.ahead_ws[None],
+            feet.foot_height,
+            jnp.ones_like(sure),
+            tread,
         )
         support = jax.tree.map(lambda x: x[0], supports)
         slide = sure * support.slide
@@ -196,10 +202,12 @@ class StrideProbe(AbstractSupportedProbe):
         stride = inputs.frame.stride if remembered else self._stride(inputs, contact, level)
         support = None
         if self.slide_to_support:
-            ahead, _ = foot_heading(inputs, level.up_ws)
             footholds_ws = jnp.stack([stride.last_ws, stride.next_ws])
-            supports = self.better_support(inputs, level, footholds_ws, foot_height, stride.known)
-            slides_ws, shares = vec.scale(ahead, supports.slide), supports.share
+            ahead_ws = _headings(inputs, stride, level.up_ws)
+            supports = self.better_support(
+                inputs, level, footholds_ws, ahead_ws, foot_height, stride.known
+            )
+            slides_ws, shares = vec.scale(ahead_ws, supports.slide), supports.share
             fraction = self._eased(stride.fraction)
             support = lerp(shares[0], shares[1], fraction)
             moved_ws = lerp(slides_ws[0], slides_ws[1], fraction[..., None])
@@ -338,16 +346,21 @@ class StrideProbe(AbstractSupportedProbe):
     ) -> Stride:
         """The stride of the animation where it is known and wanted, else the one that is given."""
         known = (labelled.known > 0.5) & self.use_strides
-        aside_ws = labelled.aside_ws
-        if aside_ws is not None:
-            aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, up_ws), 0.0)
+
+        def where_known(way_ws: Array | None) -> Array | None:
+            if way_ws is None:
+                return None
+            return jnp.where(known[..., None], vec.reject(way_ws, up_ws), 0.0)
+
         return Stride(
             labelled.standing,
             jnp.where(known[..., None], labelled.last_ws, last_ws),
             jnp.where(known[..., None], labelled.next_ws, next_ws),
             jnp.where(known, labelled.fraction, fraction),
             known.astype(fraction.dtype),
-            aside_ws,
+            where_known(labelled.aside_ws),
+            where_known(labelled.last_ahead_ws),
+            where_known(labelled.next_ahead_ws),
         )
 
     def ground_at(
@@ -369,6 +382,13 @@ def _tilted(normal: Array, way: Array, rise: Array, up_ws: Array) -> Float[Array
     steeper = vec.safe_divide(rise - climb(normal, way, up_ws), vec.dot(way, way))
     facing = vec.dot(normal, up_ws)[..., None]
     return vec.normalize(normal - facing * vec.scale(way, steeper), up_ws)
+
+
+def _headings(inputs: Inputs, stride: Stride, up_ws: Array) -> Float[Array, "ends legs 3"]:
+    """Where each foot points at its last and next foothold, unit, perpendicular to up."""
+    present, _ = foot_heading(inputs, up_ws)
+    ends = (stride.last_ahead_ws, stride.next_ahead_ws)
+    return jnp.stack([present if x is None else vec.across(x, up_ws, present) for x in ends])
 
 
 def _least_step(

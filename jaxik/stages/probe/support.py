@@ -14,7 +14,6 @@ from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
-from .base import foot_heading
 from .limits import climb
 from .swing import AbstractSwingProbe, Level
 
@@ -97,6 +96,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         inputs: Inputs,
         level: Level,
         footholds_ws: Float[Array, "ends legs 3"],
+        ahead_ws: Float[Array, "ends legs 3"],
         foot_height: Array,
         known: Float[Array, " legs"],
         tread: Tread | None = None,
@@ -107,12 +107,12 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             inputs: the frame.
             level: of the character.
             footholds_ws: of the balls, m; their height says nothing.
+            ahead_ws: unit, where the feet point there.
             foot_height: of the ankles over the soles, m.
             known: 0..1, whether a leg's feet may slide.
             tread: what each foot prefers; None has no preference.
         """
         rig, up, gate = inputs.rig, level.up_ws, inputs.gate
-        ahead, _ = foot_heading(inputs, up)
         rise = foot_height - self.ball_height
         ankle_to_ball = vec.safe_sqrt(rig.foot**2 - rise**2)
         sole = self.heel_length + ankle_to_ball + self.toe_length  # m
@@ -122,7 +122,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         margin = self.margin_at(level, footholds_ws)
         # From where a step up from the foothold ends or, without one, from the character's level.
         top = self.max_step_up + lerp(margin, level.height(foothold.point), foothold.found)
-        steps = vec.scale(ahead, tenth) * jnp.asarray(LINE, tenth.dtype)[:, None, None, None]
+        steps = vec.scale(ahead_ws, tenth) * jnp.asarray(LINE, tenth.dtype)[:, None, None, None]
         starts = level.project(footholds_ws) + steps + vec.scale(up, top)
         reach = self.max_step_up + self.max_step_down + 2.0 * margin * (1.0 - foothold.found)
         line = cast(inputs.terrain, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
@@ -138,7 +138,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             return values[first : first + len(SLIDES)]
 
         share, blocked = jnp.zeros_like(at(heights)), jnp.zeros_like(at(heights))
-        climbs = climb(at(line.normal), vec.scale(ahead, tenth), up)
+        climbs = climb(at(line.normal), vec.scale(ahead_ws, tenth), up)
         for point in map(int, SOLE):
             above = at(heights, point) - at(heights) - climbs * point
             above *= vec.safe_divide(at(line.found, point), sole)

@@ -50,6 +50,8 @@ class Swing:
     fraction: float
     aside: Array = field(default_factory=lambda: np.zeros(3))
     known: bool = False
+    last_ahead: Array | None = None
+    next_ahead: Array | None = None
     lift: float = 0.0
     pitch: float = 0.0
 
@@ -60,9 +62,9 @@ class Swing:
 
 
 class Slide(NamedTuple):
-    """How far forward a foot slides, m, and the share of its sole that is supported there."""
+    """How a foot slides, m, and the share of its sole that is supported there."""
 
-    forward: float
+    way: Array
     support: float
 
 
@@ -126,7 +128,13 @@ def swing(leg: Leg, planted: bool) -> Swing:
     if stride.known[i] > 0.5 and leg["probe.use_strides"]:
         last_ws, next_ws = level(leg, stride.last_ws[i]), level(leg, stride.next_ws[i])
         aside = np.zeros(3) if stride.aside_ws is None else across(stride.aside_ws[i], leg.up)
-        return Swing(last_ws, next_ws, float(stride.fraction[i]), aside, known=True)
+        last_ahead, next_ahead = (
+            None if ways is None else ways[i]
+            for ways in (stride.last_ahead_ws, stride.next_ahead_ws)
+        )
+        return Swing(
+            last_ws, next_ws, float(stride.fraction[i]), aside, True, last_ahead, next_ahead
+        )
     stance_time, swing_time = leg["probe.stance_time"], leg["probe.swing_time"]
     velocity = across(leg.frame.travel_ws, leg.up)
     here = level(leg, leg.pos_ws("toe"))
@@ -155,19 +163,23 @@ def eased(leg: Leg, fraction: float) -> float:
 
 def slide_to_support(leg: Leg, stride: Swing) -> tuple[Swing, Slide]:
     """The stride between footholds that support more of the sole, and how far the foot slides."""
-    slides = [slide(leg, pos, stride.known) for pos in (stride.last, stride.next)]
-    last, following = (
-        pos + slide.forward * leg.heading_ws
-        for pos, slide in zip((stride.last, stride.next), slides, strict=True)
-    )
+    ends = (stride.last, stride.last_ahead), (stride.next, stride.next_ahead)
+    slides = [slide(leg, pos, heading(leg, ahead), stride.known) for pos, ahead in ends]
+    last, following = (pos + slide.way for (pos, _), slide in zip(ends, slides, strict=True))
     done = eased(leg, stride.fraction)
-    forward, share = (lerp(start, end, done) for start, end in zip(*slides, strict=True))
-    return replace(stride, last=last, next=following), Slide(forward, share)
+    start, end = slides
+    slide = Slide(lerp(start.way, end.way, done), lerp(start.support, end.support, done))
+    return replace(stride, last=last, next=following), slide
 
 
-def slide(leg: Leg, level_point: Array, known: bool) -> Slide:
+def heading(leg: Leg, ahead: Array | None) -> Array:
+    """Where a foot points at a foothold, at right angles to up; without one, where it does now."""
+    return leg.heading_ws if ahead is None else unit(across(ahead, leg.up), leg.heading_ws)
+
+
+def slide(leg: Leg, level_point: Array, heading: Array, known: bool) -> Slide:
     """Where the foot that would stand with its ball here, if that is known, stands instead."""
-    up, heading, foothold = leg.up, leg.heading_ws, look(leg, level_point)
+    up, foothold = leg.up, look(leg, level_point)
     # The sole reaches from behind the ankle to beyond the ball.
     drop = leg["target.foot_height"] - leg["probe.ball_height"]
     between = math.sqrt(max(leg.rig.foot**2 - drop**2, 0.0))
@@ -217,7 +229,7 @@ def slide(leg: Leg, level_point: Array, known: bool) -> Slide:
 
     places = sorted(range(FURTHEST, -FURTHEST - 1, -1), key=abs) if known else [0]
     best = min(places, key=cost)
-    return Slide(best / 10.0 * sole, fit(best)[0])
+    return Slide(best / 10.0 * sole * heading, fit(best)[0])
 
 
 # The ground under a foot

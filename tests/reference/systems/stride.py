@@ -77,7 +77,7 @@ def step(
             stands = Standing(label > 0.5, label)
         stride = stride_probe.swing(leg, stands.standing)
         stride, slide = stride_probe.slide_to_support(leg, stride)
-        slid = leg.with_foot_moved(slide.forward * leg.heading_ws)
+        slid = leg.with_foot_moved(slide.way)
         standing.append(stands)
         probed.append(slid)
         balls.append(stride_probe.under_ball(slid, stride))
