@@ -168,8 +168,9 @@ def slide_to_support(leg: Leg, stride: Swing) -> tuple[Swing, Slide]:
     last, following = (pos + slide.way for (pos, _), slide in zip(ends, slides, strict=True))
     done = eased(leg, stride.fraction)
     start, end = slides
-    slide = Slide(lerp(start.way, end.way, done), lerp(start.support, end.support, done))
-    return replace(stride, last=last, next=following), slide
+    way = start.way + done * (end.way - start.way)
+    moved = Slide(way, lerp(start.support, end.support, done))
+    return replace(stride, last=last, next=following), moved
 
 
 def heading(leg: Leg, ahead: Array | None) -> Array:
