@@ -30,8 +30,12 @@ def _derivatives(function: Callable, args: tuple) -> tuple[jax.Array, ...]:
     points = (flat + jnp.stack([moves, -moves])).reshape(-1, flat.size)
     ahead, behind = jax.vmap(flat_function)(points).reshape(2, *moves.shape[:2], -1)
     quotients = (ahead - behind).swapaxes(1, 2) / (2 * jnp.asarray(STEPS)[:, None, None])
-    forward, reverse = jax.jacfwd(flat_function)(flat), jax.jacrev(flat_function)(flat)
-    return flat_function(flat), forward, reverse, quotients
+    # Traced and compiled once for the value and both modes, not once for each.
+    value, along = jax.linearize(flat_function, flat)
+    against = jax.linear_transpose(along, flat)
+    forward = jax.vmap(along, out_axes=1)(jnp.eye(flat.size))
+    (reverse,) = jax.vmap(against)(jnp.eye(value.size))
+    return value, forward, reverse, quotients
 
 
 @functools.partial(jax.jit, static_argnums=0)
