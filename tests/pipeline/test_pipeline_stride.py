@@ -3,22 +3,17 @@
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
-import jaxik
-from jaxik.maths import parameter_tree
-from jaxik.maths.parameter_tree import slots
 from reference import characters, maths, sample_poses
 from reference.systems import stride
-from reference.terrain import LegTerrains
 from support.agreement import assert_agreement
-from support.cases import QUICK
-from support.clips import named, to_frames, to_ik, to_leg_terrains, to_rig, to_terrain
-from support.strides import blocks, walk
+from support.clips import named, to_frames, to_ik, to_rig, to_terrain
+from support.stride_runs import FRAMES, UNEVEN, compiled, of_legs, solved
+from support.strides import walk
 
-FRAMES, HZ = 150, 15
+HZ = 10
 RULES = {"stride": ("label", "reach"), "by speed": ("speed", "support")}
 LOCKS = {"lock.enabled": True}
 ODD: dict[str, Any] = (  # away from the defaults
@@ -69,8 +64,6 @@ NAMES = [
     pytest.param(name, marks=pytest.mark.slow) if name in AT_LENGTH else name for name in CASES
 ]
 RIG = sample_poses.make_rig(np.random.default_rng(4))
-UNEVEN = dataclasses.replace(blocks(np.random.default_rng(3)), platform=0)
-compiled = jax.jit(jaxik.run, compiler_options=QUICK)
 
 
 def carousel(time: float) -> characters.Transform:
@@ -147,19 +140,16 @@ def test_the_defaults_are_those_of_the_reference(name):
 def test_a_clip_agrees_with_the_reference(name):
     """Of `stride`, each leg has its numbers and a terrain, in one case with its own up."""
     preset, values, *unlike = CASES[name]
-    ik, plain, ours = to_ik(values, preset), UNEVEN, to_terrain(UNEVEN)
+    frames, rules, plain = clip(*unlike), RULES[preset], UNEVEN
     if preset == "stride":
-        shared = {x.name: x.value for x in slots(ik) if x.per_leg and x.value.shape == x.shape}
-        ik = parameter_tree.replace(ik, {name: [value] * 2 for name, value in shared.items()})
-        tilts = TILTS if "tilted" in unlike else [maths.IDENTITY] * 2
-        feet = [dataclasses.replace(UNEVEN, up=maths.rotate(tilt, maths.Y)) for tilt in tilts]
-        plain = LegTerrains(UNEVEN, feet)
-        ours = to_leg_terrains(plain)
-    frames, rules = clip(*unlike), RULES[preset]
+        plain = of_legs(UNEVEN, *(TILTS if "tilted" in unlike else ()))
+        result = solved(values, RIG, plain, frames)
+    else:
+        ik, ground = to_ik(values, preset), to_terrain(UNEVEN)
+        result = compiled(ik, to_rig(RIG), ground, to_frames(frames))
     arrays = {key: np.asarray(x) if isinstance(x, list) else x for key, x in values.items()}
     parameters = characters.Parameters(arrays, defaults=stride.defaults(*rules))
     expected: dict[str, Any] = stride.run(parameters, RIG, plain, frames)
-    result = compiled(ik, to_rig(RIG), ours, to_frames(frames))
     sensed, advanced = result.trace.sensed, result.trace.advanced
     after, hit, found = advanced.state, sensed.ground.ankle, expected["found"][..., None]
     outputs: dict[str, Any] = {

@@ -23,16 +23,26 @@ from jaxik.world.frame import GroundHits
 from reference import characters, maths, sample_poses
 from reference.stages import stride_probe as reference
 from reference.terrain import Terrain as PlainTerrain
+from support import stride_runs
 from support.cases import RIG
-from support.clips import FRAMES, animate, assert_close, at, to_frames, to_ik, to_rig, to_terrain
+from support.clips import animate, assert_close, at, to_frames, to_ik, to_terrain
 from support.gradients import finite_jacobian
 from support.probing import BLOCKS, ground_under, level_blocks, quad
+from support.stride_runs import FLAT, WAYS, of_legs, on_platform, solved
 from support.strides import blocks, walk
 
-# As many triangles as the uneven blocks: both share a program.
-FLAT = to_terrain(blocks(np.random.default_rng(0), max_height=0.0, tilt=0.0, irregular=False))
-START = (0.0, 0.0, -2.0)
-WAYS = ("aside_ws", "last_ahead_ws", "next_ahead_ws")  # of strides, which may be None
+FLOORS, HZ = of_legs(FLAT), 25.0
+
+
+def four_seconds(start: float = -2.0, **changes: Any) -> list[characters.Frame]:
+    """A walk, m forward from the start, on a platform that stays where it is."""
+    still = {name: [sample_poses.STILL] for name in ("platforms", "platforms_before")}
+    frames = walk(RIG, stride_runs.FRAMES, hz=HZ, start=start * maths.Z, **still, **changes)
+    none = dict.fromkeys(WAYS, np.zeros((2, 3)))
+    return [
+        dataclasses.replace(frame, stride=dataclasses.replace(frame.stride, **none))
+        for frame in frames
+    ]
 
 
 # Flat floor.
@@ -40,11 +50,11 @@ WAYS = ("aside_ws", "last_ahead_ws", "next_ahead_ws")  # of strides, which may b
 
 @pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
 def test_nothing_changes_on_a_flat_floor(known: bool):
-    frames = to_frames(walk(RIG, FRAMES, known=known, heading=0.1, start=START))
+    plain = four_seconds(known=known, heading=0.1)
+    frames = to_frames(plain)
     legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
     assert legs.max() > 0.99 * (sample_poses.THIGH + sample_poses.SHIN), "knees are straight"
-    ik = to_ik({"lock.enabled": True}, "stride")
-    result = jaxik.run(ik, to_rig(RIG), FLAT, frames)
+    result = solved({"lock.enabled": True}, RIG, FLOORS, plain)
     assert 0.3 < np.asarray(result.trace.advanced.state.lock.locked).mean() < 0.9
     sensed, effector = result.trace.sensed, result.trace.advanced.effector
     assert_close(effector.target_ws, sensed.ankle_ws, 1e-9)
@@ -130,7 +140,7 @@ def test_a_cliff_and_its_edge_do_not_change_the_ground():
 
 def test_a_step_fades_out_gradually_as_it_becomes_too_high():
     """Between 0.6 and 0.7 m down, the foot returns to the height of its last foothold."""
-    drops, arrived = np.linspace(0.5, 0.8, 31), swing(np.full(801, 1.0))
+    drops, arrived = np.linspace(0.58, 0.72, 15), swing(np.full(801, 1.0))
     grounds = [level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -drop)) for drop in drops]
     height = np.array([heights(ground, arrived)[0] for ground in grounds])
     followed, ignored = drops < 0.6, drops > 0.7 + 1e-9
@@ -158,15 +168,16 @@ def test_stairs_are_climbed_that_are_as_high_as_a_ledge_that_is_refused():
 
 def test_a_locked_ball_does_not_slide_while_the_heel_rises():
     """On a walk whose standing feet slip sideways."""
-    plain, slips = walk(RIG, FRAMES, start=START), []
+    plain, slips = four_seconds(), []
     for index, frame in enumerate(plain):
-        pos = frame.world_from_model.pos + 0.08 * index / 60 * maths.X
+        pos = frame.world_from_model.pos + 0.08 * index / HZ * maths.X
         root = frame.world_from_model._replace(pos=pos)
         plain[index] = dataclasses.replace(frame, world_from_model=root)
-    frames = to_frames(sample_poses.with_speeds(plain))
+    plain = sample_poses.with_speeds(plain)
+    frames = to_frames(plain)
     for hold_ball in (True, False):
         values = {"lock.enabled": True, "lock.hold_ball": hold_ball, "lock.lock_half_life": 0.0}
-        result = jaxik.run(to_ik(values, "stride"), to_rig(RIG), FLAT, frames)
+        result = solved(values, RIG, FLOORS, plain)
         ball = jax.vmap(jaxik.Transform.apply)(frames.world_from_model, result.pose.toe.pos)
         locked = np.asarray(result.trace.advanced.state.lock.locked) > 0
         locked_twice = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
@@ -460,12 +471,13 @@ def test_the_angle_has_finite_gradients_where_there_is_no_solution():
 @functools.cache
 def over_blocks() -> SimpleNamespace:
     """Heels on a walk across uneven blocks; (frames, legs), but for the clip and its result."""
-    frames = to_frames(walk(RIG, FRAMES, start=(0.0, 0.0, -2.5), heading=0.1))
+    plain = four_seconds(start=-2.5, heading=0.1)
     ground = blocks(np.random.default_rng(5), max_height=0.2, irregular=False)
-    result = jaxik.run(to_ik(VALUES, "stride"), to_rig(RIG), to_terrain(ground), frames)
+    result = solved(VALUES, RIG, of_legs(on_platform(ground.triangles)), plain)
+    frames = to_frames(plain)
     sensed, advanced = result.trace.sensed, result.trace.advanced
     hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
-    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws
     before = advanced.foothold_ws + advanced.hold.offset_ws + lift - hip
     animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
     extension = VALUES["effector.extension"] * (sample_poses.THIGH + sample_poses.SHIN)
@@ -522,7 +534,7 @@ def test_the_ball_stays_in_place_while_the_heel_rises():
     sensed, advanced = walk.result.trace.sensed, walk.result.trace.advanced
     world = walk.frames.world_from_model
     ball = jax.vmap(jaxik.Transform.apply)(world, walk.result.pose.toe.pos)
-    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws
     moved = np.asarray(ball - (advanced.foothold_ws + lift + walk.to_ball_ws))
     arrived = (np.asarray(walk.result.reached) > 0) & (np.asarray(walk.result.aimed) > 0)
     assert (walk.lift[arrived] > 0.02).any()
