@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from reference import maths
+from reference import maths, sample_poses
 from reference.systems import record as reference
-from reference.terrain import Terrain
 from support.clips import FLAT, animate, make_rig, stepping, to_frames, to_ik, to_rig, to_terrain
 
 RIG = make_rig()
@@ -23,14 +22,22 @@ FIRM = {  # locked at once, and until the foot is lifted
 HORIZONTAL = np.array([1.0, 0.0, 1.0])
 
 
-def run(values: dict, frames: list, ground: Terrain = FLAT) -> jaxik.Result:
-    return jaxik.run(to_ik(values), to_rig(RIG), to_terrain(ground), to_frames(frames))
+GROUND = to_terrain(dataclasses.replace(FLAT, platform=0))
+
+
+def run(values: dict, frames: list) -> jaxik.Result:
+    """On a platform, which all frames have."""
+    return jaxik.run(to_ik(values), to_rig(RIG), GROUND, to_frames(frames))
+
+
+def slips(drift: float = 0.15) -> list:
+    """A walk whose standing feet slip over the ground, by this speed, m/s."""
+    return stepping(RIG, drift=drift, platform=lambda time: sample_poses.STILL)
 
 
 @functools.cache
 def slipping() -> jaxik.Result:
-    """A walk whose standing feet slip over the ground."""
-    return run({}, stepping(RIG, drift=0.15))
+    return run({}, slips())
 
 
 def tracks(result: jaxik.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -72,7 +79,7 @@ def test_a_locked_foot_slips_less_and_lifts_as_animated():
 
 
 def test_a_foot_locked_firmly_does_not_move_at_all():
-    result = run(FIRM, stepping(RIG, drift=0.15))
+    result = run(FIRM, slips())
     targets, _, _, locked = tracks(result)
     locked_twice = locked[1:] & locked[:-1]
     assert locked_twice.mean() > 0.3
@@ -94,8 +101,7 @@ def test_a_locked_foot_stays_on_a_platform_that_moves_and_turns(root):
             return np.zeros(3)
         return maths.apply(carousel(time), maths.unapply(start, np.zeros(3)))
 
-    ground = dataclasses.replace(FLAT, platform=0)
-    result = run(FIRM, animate(RIG, platform=carousel, place=place), ground)
+    result = run(FIRM, animate(RIG, platform=carousel, place=place))
     targets, footholds, _, locked = tracks(result)
     assert locked.all()
     on_platform = np.array(
@@ -120,7 +126,7 @@ def test_a_locked_foot_stays_on_a_platform_that_moves_and_turns(root):
 
 def test_a_lock_lets_go_in_the_frame_in_which_its_knee_would_open_too_far():
     max_angle = 2.5
-    result = run(FIRM | {"lock.release_max_angle": max_angle}, stepping(RIG, drift=0.6))
+    result = run(FIRM | {"lock.release_max_angle": max_angle}, slips(0.6))
     targets, _, unlocked, locked = tracks(result)
     assert result.trace is not None
     sensed = result.trace.sensed
