@@ -176,17 +176,11 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 # What the reference says of these two, in `tests/pipeline`, covers the same numbers.
-LARGE = "ozz", "mec"  # whose derivatives take long to compile
-LARGEST = [pytest.param(name, marks=pytest.mark.slow) for name in LARGE]
+LARGEST = [pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "mec")]
 # In `test_own_rules`, `test_limits`, `test_foot_placement` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
 IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
 IN_OWN_TESTS += ("root.max_gap",)
-
-
-@functools.cache
-def outcomes(preset: str) -> cases.Outcomes:
-    return cases.outcomes_of(CASES[preset], cases.system(preset))
 
 
 @pytest.mark.parametrize("preset", CASES)
@@ -199,18 +193,17 @@ def test_all_numbers_switches_and_masks_of_a_system_have_a_case(preset: str):
 
 @pytest.mark.parametrize("preset", ["unreal", *LARGEST])
 def test_each_leaf_has_the_expected_effect_or_none(preset: str):
-    if preset in LARGE:
-        by_value = cases.outcomes_of(CASES[preset], cases.system(preset), sloped=False)
-        assert not by_value.without_effect()
-    else:
-        assert not outcomes(preset).without_effect()
+    by_value = cases.outcomes_of(CASES[preset], cases.system(preset), sloped=False)
+    assert not by_value.without_effect()
 
 
-@pytest.mark.parametrize("preset", ["unreal", *LARGEST])
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", CASES)
 def test_the_derivative_of_each_number_is_its_difference_quotient(preset: str):
-    assert not outcomes(preset).with_wrong_slope()
+    assert not cases.outcomes_of(CASES[preset], cases.system(preset)).with_wrong_slope()
 
 
-@pytest.mark.parametrize("preset", ["unreal", LARGEST[0]])
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["unreal", "ozz"])
 def test_values_and_derivatives_are_finite_where_formulas_are_singular(preset: str):
     singular.assert_sound(preset)
