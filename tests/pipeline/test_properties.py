@@ -22,7 +22,7 @@ from jaxik.maths import parameter_tree, quat
 from jaxik.world.skeleton import bone_lengths
 from reference import maths, sample_poses
 from reference.terrain import Terrain as PlainTerrain
-from support import clips
+from support import cases, clips
 from support.cases import QUICK, Either, stacked
 from support.clips import BROKEN, FLAT, FRAMES, HZ, ODD, at, to_ik, to_rig
 
@@ -389,7 +389,7 @@ def single(tree):
 @functools.cache
 def traced(system: str):
     """The program of a clip in single precision; it decides by either gate."""
-    ik = clips.by_speed() if system == "by speed" else getattr(jaxik.presets, system)()
+    ik = cases.system(system) if system == "by speed" else getattr(jaxik.presets, system)()
     inputs = single((ik, *Row(DRIFTING, wander()).inputs()[1:]))
     with jax.numpy_dtype_promotion("strict"):
         return jax.make_jaxpr(jaxik.run)(*inputs)
@@ -427,6 +427,7 @@ def test_a_single_precision_program_contains_no_doubles(system: str):
 def test_floats_of_mixed_width_become_those_of_the_rig(narrow: str):
     names = ("ik", "rig", "terrain", "frames")
     inputs: dict[str, Any] = dict(zip(names, Row(DRIFTING, wander()).inputs()[:4], strict=True))
+    inputs["ik"] = to_ik({}, "unreal")  # the system that is traced soonest
     inputs[narrow] = single(inputs[narrow])
     ik, rig, ground, frames = inputs.values()
     after, result = jax.eval_shape(jaxik.resume, *(ik, rig, ground, jaxik.init(ik, rig), frames))
