@@ -24,7 +24,7 @@ from support.agreement import assert_agreement
 from support.cases import QUICK
 from support.clips import ODD, at, named, to_ik
 
-LEGS, HZ, FRAMES = 3, 20, 200
+LEGS, HZ, FRAMES = 3, 12, 120
 STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # start, end, ..., fractions of the clip
 REFERENCES: dict[str, Any] = {"record": record, "ozz": ozz, "unreal": unreal, "mec": mec}
 CASES: dict[str, dict[str, dict[str, Any]]] = {
