@@ -90,7 +90,7 @@ def resumed(frames: jaxik.Frame, tracks: Tracks) -> tuple[jaxik.State, jaxik.Res
     return jaxik.resume(SYSTEM, RIG, GROUND, start, frames, tracks=tracks)
 
 
-def stepped(frames: jaxik.Frame, tracks: Tracks) -> tuple[jaxik.State, jaxik.Result]:
+def stepped(frames: jaxik.Frame, tracks: dict[str, np.ndarray]) -> tuple[Any, jaxik.Result]:
     """The clip by live characters, each with the system that the tracks make of ours.
 
     Those of other tests share their program.

@@ -39,10 +39,10 @@ def four_seconds(start: float = -2.0, **changes: Any) -> list[characters.Frame]:
     still = {name: [sample_poses.STILL] for name in ("platforms", "platforms_before")}
     frames = walk(RIG, stride_runs.FRAMES, hz=HZ, start=start * maths.Z, **still, **changes)
     none = dict.fromkeys(WAYS, np.zeros((2, 3)))
-    return [
-        dataclasses.replace(frame, stride=dataclasses.replace(frame.stride, **none))
-        for frame in frames
-    ]
+    for frame in frames:
+        assert frame.stride is not None
+        frame.stride = dataclasses.replace(frame.stride, **none)
+    return frames
 
 
 # Flat floor.
