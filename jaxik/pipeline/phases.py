@@ -100,6 +100,7 @@ def sense(
     with jax.named_scope("warp"):
         inputs, warp_ws = _warped(ik, inputs, turn)
         frame = inputs.frame
+    inputs = dataclasses.replace(inputs, foot_heading_ws=foot_heading(inputs))
     with jax.named_scope("probe"):
         ground = ik.probe.ground(inputs, contact, ik.target.foot_height)
     with jax.named_scope("target"):
@@ -124,7 +125,7 @@ def sense(
         ankle_rot_ws=ankle.rot,
         foot_speed=frame.foot_speed,
         ball_ws=frame.world_from_model.apply(frame.pose.toe.pos),
-        ahead_ws=foot_heading(inputs, up)[0],
+        ahead_ws=foot_heading(inputs)[0],
         rot_ws=rot_ws,
         thigh=thigh,
         shin=shin,

@@ -120,7 +120,7 @@ class AbstractAnimatedFoot(AbstractFoot):
         rot_ws = animated_ankles(inputs.frame).rot
         if ground.pitch is None:
             return rot_ws
-        _, right = foot_heading(inputs, inputs.terrain.leg_up_ws)
+        _, right = foot_heading(inputs)
         return quat.multiply(quat.from_axis_angle(right, ground.pitch), rot_ws)
 
 
@@ -229,7 +229,7 @@ class FlatFoot(AbstractFoot):
 
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
         up_ws = inputs.terrain.leg_up_ws
-        ahead, right = foot_heading(inputs, up_ws)
+        ahead, right = foot_heading(inputs)
         pitch = rise_angle(ground.ankle, ground.toe, ahead, up_ws)
         roll = rise_angle(ground.ankle, ground.corner, right, up_ws)
         tilt = quat.multiply(quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, -roll))

@@ -23,6 +23,11 @@ class Inputs:
     gate: AbstractGate
     centre_ws: Float[Array, "3"] | None = None
     """m, where world space has its origin now; None where that has not changed."""
+    foot_heading_ws: tuple[Float[Array, "legs 3"], Float[Array, "legs 3"]] | None = None
+    """`jaxik.stages.probe.foot_heading`, for all stages at once; None where each computes it.
+
+    Without it, programs of `stride` take a seventh longer to compile.
+    """
 
     @property
     def bearing(self) -> Float[Array, "*legs"]:

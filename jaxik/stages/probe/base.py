@@ -83,12 +83,14 @@ def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
     return frame.pose.ankle.pos + quat.rotate(foot, vec.stack(rig.side * x, y, z))
 
 
-def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
-    """Forward and right of each animated foot, unit, perpendicular to up, world space.
+def foot_heading(inputs: Inputs) -> tuple[Array, Array]:
+    """Forward and right of each animated foot, unit, perpendicular to its up, world space.
 
     A foot that points along up gets those of the character.
     """
-    frame = inputs.frame
+    if inputs.foot_heading_ws is not None:
+        return inputs.foot_heading_ws
+    frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
     foot = quat.multiply(animated_ankles(frame).rot, inputs.rig.ankle_from_foot)
     sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
     ahead = vec.across(sole, up_ws, heading(frame.world_from_model, up_ws)[0])

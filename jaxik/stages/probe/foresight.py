@@ -159,7 +159,7 @@ def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
         ahead=time_ahead(vec.reject(frame.velocity_ws, up), ankle.pos - hip),
         pitch=vec.safe_arctan2(vec.dot(sole, up), vec.length(vec.reject(sole, up))),
         planted=contact.planted,
-        ahead_ws=foot_heading(inputs, up)[0],
+        ahead_ws=foot_heading(inputs)[0],
         foot_height=foot_height,
         frame=frame,
         rig=inputs.rig,

@@ -155,7 +155,7 @@ class CornerProbe(AbstractLimitedProbe):
         ankle = with_weight(ankle, jnp.where(self.active, ankle.found, 0.0))
         level = foot.pos - vec.scale(up, foot_height)
         sole = lerp(level, ankle.point, ankle.found[..., None])
-        ahead, right = foot_heading(inputs, up)
+        ahead, right = foot_heading(inputs)
         over = sole + vec.scale(up, foot_height)
         sides = (vec.scale(ahead, self.foot_length), vec.scale(right, self.half_width))
         beside = hits_below(*(over + offset for offset in sides))

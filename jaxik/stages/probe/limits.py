@@ -159,7 +159,7 @@ class AbstractLimitedProbe(AbstractProbe):
         if not self.limited:
             return self.cast(inputs, starts_ws, reach, layers)
         up = inputs.terrain.leg_up_ws
-        forward, aside = foot_heading(inputs, up)
+        forward, aside = foot_heading(inputs)
         away = vec.scale(forward + aside, self.support_radius)
         starts = jnp.stack([starts_ws, starts_ws + away, starts_ws - away])
         hits = self.cast(inputs, starts, reach, layers)
@@ -219,7 +219,7 @@ class AbstractLimitedProbe(AbstractProbe):
     ) -> Array:
         """0..1, how far each hit is accepted for the ground around it."""
         up, radius = inputs.terrain.leg_up_ws, self.support_radius
-        ahead, right = foot_heading(inputs, up)
+        ahead, right = foot_heading(inputs)
         forward, aside = jnp.moveaxis(jnp.asarray(RING, starts_ws.dtype), -1, 0)[..., None]
         ways = vec.scale(vec.scale(ahead, forward) + vec.scale(right, aside), radius)
         ways = ways.reshape(len(RING), *[1] * (starts_ws.ndim - ahead.ndim), *ahead.shape)

@@ -386,7 +386,7 @@ def _tilted(normal: Array, way: Array, rise: Array, up_ws: Array) -> Float[Array
 
 def _headings(inputs: Inputs, stride: Stride, up_ws: Array) -> Float[Array, "ends legs 3"]:
     """Where each foot points at its last and next foothold, unit, perpendicular to up."""
-    present, _ = foot_heading(inputs, up_ws)
+    present, _ = foot_heading(inputs)
     ends = (stride.last_ahead_ws, stride.next_ahead_ws)
     return jnp.stack([present if x is None else vec.across(x, up_ws, present) for x in ends])
 

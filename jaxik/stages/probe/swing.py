@@ -282,7 +282,7 @@ def bump(fraction: Array, peak: float) -> Array:
 
 def pitch_rotation(inputs: Inputs, pitch: Array) -> Float[Array, "legs 4"]:
     """The rotation that lifts the toes of each foot by an angle, rad, world space."""
-    return quat.from_axis_angle(foot_heading(inputs, inputs.terrain.leg_up_ws)[1], pitch)
+    return quat.from_axis_angle(foot_heading(inputs)[1], pitch)
 
 
 def _balls(inputs: Inputs) -> Array:
