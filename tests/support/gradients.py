@@ -20,27 +20,32 @@ ROWS = 40
 
 @functools.partial(jax.jit, static_argnums=0)
 def _derivatives(function: Callable, args: tuple) -> tuple[jax.Array, ...]:
-    """Value (outputs), Jacobians (outputs, inputs) by forward and by reverse mode, and central
-    differences (steps, outputs, inputs), one for each of `STEPS`.
-    """
+    """Value (outputs), and Jacobians (outputs, inputs) by forward and by reverse mode."""
     flat, restore = ravel_pytree(args)
-    flat_function = functools.partial(_flat, function, restore)
-    moves = jnp.asarray(STEPS)[:, None, None] * jnp.eye(flat.size)
-    # One batch for all steps and both sides: the function is compiled once instead of 14 times.
-    points = (flat + jnp.stack([moves, -moves])).reshape(-1, flat.size)
-    ahead, behind = jax.vmap(flat_function)(points).reshape(2, *moves.shape[:2], -1)
-    quotients = (ahead - behind).swapaxes(1, 2) / (2 * jnp.asarray(STEPS)[:, None, None])
     # Traced and compiled once for the value and both modes, not once for each.
-    value, along = jax.linearize(flat_function, flat)
+    value, along = jax.linearize(functools.partial(_flat, function, restore), flat)
     against = jax.linear_transpose(along, flat)
     forward = jax.vmap(along, out_axes=1)(jnp.eye(flat.size))
     (reverse,) = jax.vmap(against)(jnp.eye(value.size))
-    return value, forward, reverse, quotients
+    return value, forward, reverse
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _derivatives_of_rows(function: Callable, rows: tuple) -> tuple[jax.Array, ...]:
-    return jax.vmap(functools.partial(_derivatives, function))(rows)
+def _quotients(function: Callable, args: tuple) -> jax.Array:
+    """Central differences (steps, outputs, inputs), one for each of `STEPS`."""
+    flat, restore = ravel_pytree(args)
+    moves = jnp.asarray(STEPS)[:, None, None] * jnp.eye(flat.size)
+    # One batch for all steps and both sides: the function is compiled once instead of 14 times.
+    points = (flat + jnp.stack([moves, -moves])).reshape(-1, flat.size)
+    values = jax.vmap(functools.partial(_flat, function, restore))(points)
+    ahead, behind = values.reshape(2, *moves.shape[:2], -1)
+    return (ahead - behind).swapaxes(1, 2) / (2 * jnp.asarray(STEPS)[:, None, None])
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _of_rows(way: Callable, function: Callable, rows: tuple) -> Any:
+    """What one of both gives for each row of the arguments."""
+    return jax.vmap(functools.partial(way, function))(rows)
 
 
 def _flat(function: Callable, restore: Callable, flat: jax.Array) -> jax.Array:
@@ -55,7 +60,7 @@ def _floats(args: tuple) -> tuple:
 
 def _checked(derivatives: Sequence, args: tuple) -> np.ndarray:
     """The Jacobian (outputs, inputs), finite and equal in both modes."""
-    value, forward, reverse, _ = map(np.asarray, derivatives)
+    value, forward, reverse = map(np.asarray, derivatives)
     for name, x in {"value": value, "forward mode": forward, "reverse mode": reverse}.items():
         assert np.isfinite(x).all(), f"{name} {x} at {args}"
     scale = max(1.0, np.abs(forward).max())
@@ -65,8 +70,10 @@ def _checked(derivatives: Sequence, args: tuple) -> np.ndarray:
     return forward
 
 
-def _assert_differences_match(derivatives: Sequence, args: tuple, tolerance: float) -> None:
-    forward, quotients = _checked(derivatives, args), np.asarray(derivatives[-1])
+def _assert_differences_match(
+    derivatives: Sequence, quotients: np.ndarray, args: tuple, tolerance: float
+) -> None:
+    forward = _checked(derivatives, args)
     steadiest = np.abs(np.diff(quotients, axis=0)).argmin(axis=0)
     expected = np.take_along_axis(quotients[1:], steadiest[None], axis=0)[0]
     scale = max(1.0, np.abs(expected).max())
@@ -93,30 +100,32 @@ def assert_gradients_match(function: Callable, *args: Any, tolerance: float = 1e
     may bend on the scale of `TINY`. Arguments as for `finite_jacobian`.
     """
     args = _floats(args)
-    _assert_differences_match(_derivatives(function, args), args, tolerance)
+    quotients = np.asarray(_quotients(function, args))
+    _assert_differences_match(_derivatives(function, args), quotients, args, tolerance)
 
 
-def _each_row(function: Callable, rows: tuple) -> Iterator[tuple[Sequence, tuple]]:
-    """The derivatives and the arguments of each row; single numbers are the same in all."""
+def _each_row(way: Callable, function: Callable, rows: tuple) -> Iterator[tuple[Any, tuple]]:
+    """What is computed of each row, and its arguments; single numbers are the same in all."""
     rows = _floats(rows)
     count = max(len(leaf) for leaf in jax.tree.leaves(rows) if leaf.ndim)
     # Repeated, so that fewer rows need no program of their own.
     size = max(count, ROWS)
     rows = jax.tree.map(lambda leaf: np.resize(leaf, (size, *leaf.shape[1:])), rows)
-    derivatives = [np.asarray(x) for x in _derivatives_of_rows(function, rows)]
+    results = jax.device_get(_of_rows(way, function, rows))
     for row in range(count):
-        yield [x[row] for x in derivatives], jax.tree.map(lambda leaf, row=row: leaf[row], rows)
+        yield jax.tree.map(lambda leaf, row=row: leaf[row], (results, rows))
 
 
 def finite_jacobians(function: Callable, *rows: Any) -> np.ndarray:
     """`finite_jacobian` of each row of the arguments: (rows, outputs, inputs)."""
-    return np.stack([_checked(*row) for row in _each_row(function, rows)])
+    return np.stack([_checked(*row) for row in _each_row(_derivatives, function, rows)])
 
 
 def assert_all_gradients_match(function: Callable, *rows: Any, tolerance: float = 1e-6) -> None:
     """`assert_gradients_match` of each row of the arguments."""
-    for derivatives, args in _each_row(function, rows):
-        _assert_differences_match(derivatives, args, tolerance)
+    ways = (_each_row(way, function, rows) for way in (_derivatives, _quotients))
+    for (derivatives, args), (quotients, _) in zip(*ways, strict=True):
+        _assert_differences_match(derivatives, quotients, args, tolerance)
 
 
 def assert_finite_in_single_precision(function: Callable, *rows: np.ndarray) -> None:
