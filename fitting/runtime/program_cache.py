@@ -235,10 +235,11 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 
     @functools.wraps(function)
     def call(*args: Inputs.args, **named: Inputs.kwargs) -> Output:
-        leaves = jax.tree.leaves((args, named))
+        leaves, structure = jax.tree.flatten((args, named))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return inside(*args, **named)
-        args, named = committed((args, named))
+        if (fixed := _committed(leaves)) is not leaves:
+            args, named = jax.tree.unflatten(structure, fixed)
         try:
             return outside(*args, **named)
         finally:
@@ -257,14 +258,22 @@ def committed(tree: Tree) -> Tree:
     committed before. Arrays on several devices stay as they are.
     """
     leaves, structure = jax.tree.flatten(tree)
-    arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+    fixed = _committed(leaves)
+    return tree if fixed is leaves else jax.tree.unflatten(structure, fixed)
+
+
+def _committed(leaves: list[Any]) -> list[Any]:
+    """The same list if nothing in it has to be committed or may be."""
     loose = [i for i, leaf in enumerate(leaves) if not getattr(leaf, "committed", True)]
-    if not loose or len({device for array in arrays for device in array.devices()}) > 1:
-        return tree
-    device = leaves[loose[0]].sharding
+    if not loose:
+        return leaves
+    shardings = {leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array)}
+    if len(set().union(*(sharding.device_set for sharding in shardings))) > 1:
+        return leaves
+    fixed, device = list(leaves), leaves[loose[0]].sharding
     for i, leaf in zip(loose, jax.device_put([leaves[i] for i in loose], device), strict=True):
-        leaves[i] = leaf
-    return jax.tree.unflatten(structure, leaves)
+        fixed[i] = leaf
+    return fixed
 
 
 def _place(function: Callable, arguments: Arguments) -> _Place | None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from fitting.inference.sharding import over_devices
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
-from fitting.runtime.program_cache import cached
+from fitting.runtime.program_cache import cached, committed
 from jaxik import lanes
 
 from .chain import Chain, Identity, LastStep, RandomState
@@ -112,7 +112,7 @@ def steps(
     """
     identity = chain.identity
     dtype = problem.space.start.dtype
-    problem = over_devices(problem)
+    problem = committed(over_devices(problem))
 
     def evaluate(u: np.ndarray) -> np.ndarray:
         """Half of the walkers at a time, as the moves need them: one program."""
