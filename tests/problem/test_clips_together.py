@@ -43,7 +43,7 @@ end = {start + seconds}
     for name, base, start, seconds in (
         ("uneven_walk", "uneven_walk", 1.0, 0.4),
         ("uneven_walk", "uneven_walk", 3.0, 0.4),
-        ("stop_and_go_ozz", "stop_and_go", 1.0, 0.2),  # at twice the rate
+        ("stop_and_go_ozz", "stop_and_go", 1.0, 0.4),
     )
 )
 TRACKED = "leg.soften"
