@@ -38,7 +38,7 @@ from support.small_studies import SAMPLE, kept, write_calibration
 from support.watching import listening
 
 RANKED = ["pelvis.on_gain", "foot.max_pitch", "log-probability"]
-COUNT = 8  # of the replicates that all tests share
+COUNT = 5  # of the replicates that all tests share
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def made(finished, tmp_path) -> Made:
 def test_a_right_program_is_inside_all_bounds(finished):
     assessment = finished.assessment
     assert assessment.inside and assessment.outside == []
-    assert assessment.fit_coverage.total == 16 and assessment.fit_coverage.fraction > 0.85
+    assert assessment.fit_coverage.total == 2 * COUNT and assessment.fit_coverage.fraction > 0.85
     assert list(assessment.profile_coverage) == [0.5, 0.8]
     assert list(assessment.ranks) == RANKED
     assert {len(test.ranks) for test in assessment.ranks.values()} == {COUNT}
@@ -233,7 +233,7 @@ def test_a_cluster_makes_the_same_replicates(made, experiment_file, tmp_path):
 def test_finished_replicates_are_not_repeated_and_new_ones_share_their_programs(
     made, experiment_file
 ):
-    for name in ("fits/0006", "fits/0007", "chains/0005", "chains/0006", "chains/0007"):
+    for name in ("fits/0003", "fits/0004", "chains/0002", "chains/0003", "chains/0004"):
         (made.folder / f"{name}.json").unlink()
     programs: dict[str, int] = {}  # compiled until a replicate was made
     with compilations() as compiled:
@@ -244,12 +244,12 @@ def test_finished_replicates_are_not_repeated_and_new_ones_share_their_programs(
                 programs[f"{kind} {result['number']}"] = len(compiled)
 
         with listening(reported=note):
-            first = calibrate(experiment_file, made.folder, 6)
-            assert not programs and first == Calibration(made.kept.fits[:6], [])
+            first = calibrate(experiment_file, made.folder, 3)
+            assert not programs and first == Calibration(made.kept.fits[:3], [])
             calibrate(experiment_file, made.folder, COUNT, chains=True)
-    assert list(programs) == ["fit 6", "fit 7", "chain 5", "chain 6", "chain 7"]
-    assert programs["fit 6"] == programs["fit 7"]
-    assert programs["chain 5"] == programs["chain 7"]
+    assert list(programs) == ["fit 3", "fit 4", "chain 2", "chain 3", "chain 4"]
+    assert programs["fit 3"] == programs["fit 4"]
+    assert programs["chain 2"] == programs["chain 4"]
 
 
 def test_the_folder_of_another_calibration_or_an_unknown_one_is_refused(
@@ -259,7 +259,7 @@ def test_the_folder_of_another_calibration_or_an_unknown_one_is_refused(
     for top, rest, words in (
         ("seed = 1", SAMPLE, "differs from .* in: seed; name another folder"),
         ("fps = 20.0", SAMPLE, "in: problem; name"),
-        ("", SAMPLE.replace("400", "500"), "in: sample; name"),
+        ("", SAMPLE.replace("240", "250"), "in: sample; name"),
         ("", SAMPLE + "[fit]\nstarts = 3\n", "in: fit; name"),
         ("", SAMPLE + "[start]\npelvis.on_gain = 0.5\n", "in: start; name"),
     ):
@@ -307,13 +307,13 @@ def test_the_folder_has_a_report(finished):
 def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, capsys, undrawn):
     path = small_studies.quick_calibration(tmp_path, monkeypatch, shift=6.0)
     out = tmp_path / "out"
-    assert main.main(["calibrate", str(path), "-n", "8", "-o", str(out)]) == 5
+    assert main.main(["calibrate", str(path), "-n", "5", "-o", str(out)]) == 5
     printed = capsys.readouterr().out
-    assert "\nNot calibrated.\n\n- Of 8 simulated motions, outside their bounds: the" in printed
+    assert "\nNot calibrated.\n\n- Of 5 simulated motions, outside their bounds: the" in printed
     assert "**no**, too few" in printed
     assert not (out / "ranks.png").exists(), "there are no chains"
     page = Page(out / pages.PAGE)
-    assert "hill Not calibrated ◐ Of 8 simulated motions, outside their bounds: the" in page.text
+    assert "hill Not calibrated ◐ Of 5 simulated motions, outside their bounds: the" in page.text
     assert "No posterior was sampled" in page.text and "no, too few" in page.text
 
 
