@@ -17,6 +17,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem
 from fitting.problem.space import FreeParameter, scale_width, to_fractions
 from fitting.runtime.precision import in_float64
+from fitting.runtime.program_cache import committed
 
 from . import noise
 from .optimise.solution import Solution
@@ -171,6 +172,7 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
     Raises:
         ValueError: if the Jacobian at the solution is not finite.
     """
+    problem = committed(problem)
     space = problem.space
     if not space.size:
         none = np.zeros(0)

@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.precision import for_other_thread, in_float64
+from fitting.runtime.program_cache import committed
 
 from . import checkpoints, levenberg_marquardt
 from .descent import descend, jacobian_at, point_of, polish
@@ -77,6 +78,7 @@ def find_best_fit(
         raise ValueError(f"starts is {starts}, wanted at least 1")
     if not problem.space.size:
         return _nothing_free(problem)
+    problem = committed(problem)
     first = problem.space.start if first is None else first
     latest = SearchState.at(np.asarray(first), seed=seed)
     current = checkpoints.current()
