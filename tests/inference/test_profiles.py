@@ -45,8 +45,8 @@ from support import toy
 from support.curves import curve_problem
 from support.problems import Fractions, parameter, problem_of, problem_of_fractions
 
-NOISE = 0.05
-TIME = jnp.linspace(0, 2, 400)
+NOISE = 0.035
+TIME = jnp.linspace(0, 2, 200)
 Assessed = tuple[Problem, Solution, Identifiability]
 
 
