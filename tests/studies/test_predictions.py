@@ -7,6 +7,7 @@ from pathlib import Path
 
 import equinox as eqx
 import h5py
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ from support.commands import refusal
 from support.experiments import write
 from support.pages import Page
 from support.problems import posterior_of
+from support.small_studies import HALF_SECOND
 
 TRUTH = np.array([0.7, -1.2])
 KINDS = ("ankle", "knee", "pelvis", "foot")
@@ -41,8 +43,8 @@ KINDS = ("ankle", "knee", "pelvis", "foot")
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    """A second of the uneven walk with noise of a known truth."""
-    path = write(tmp_path_factory.mktemp("replay"), top='loss = "squares"')
+    """Half a second of the uneven walk with noise of a known truth."""
+    path = write(tmp_path_factory.mktemp("replay"), top='loss = "squares"', clips=HALF_SECOND)
     loaded = problems.make_problem(experiment_files.load_experiment(path))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "_motions", motions)
@@ -63,10 +65,10 @@ def draws_near_the_truth(problem: Problem, draws: int = 60) -> Posterior:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def half_seconds():
-    """Two blocks in a clip of a second."""
+def short_blocks():
+    """Two blocks in a clip of half a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sample_replay, "SECONDS", 0.5)
+        patch.setattr(sample_replay, "SECONDS", 0.25)
         yield
 
 
@@ -104,7 +106,7 @@ def test_other_noise_is_found_out_kind_by_kind(problem):
 
 
 def test_an_outlier_is_found_out(problem):
-    knees = problem.data[0].reference.knee_ws.at[20, 0, 1].add(0.4)
+    knees = problem.data[0].reference.knee_ws.at[10, 0, 1].add(0.2)
     spoilt = eqx.tree_at(lambda p: p.data[0].reference.knee_ws, problem, knees)
     checks = replay(spoilt, draws_near_the_truth(problem), seed=0).checks
     of_kinds = {check.kind: check.surprises for check in checks}
@@ -135,9 +137,13 @@ def test_bands_hold_the_capture_and_are_drawn(replayed):
 def plain_residuals(problem: Problem, u: Array) -> Array:
     """Before the loss, one kind after another."""
     (scene,) = problem.data
-    errors = residuals.errors_by_kind(scene, playback.run(problem.space.unpack(u), scene))
-    of_kinds = residuals.residuals_by_kind(scene, errors).values()
-    return jnp.concatenate([of_kind.ravel() for of_kind in of_kinds])
+    return plain_residuals_of(scene, playback.run(problem.space.unpack(u), scene))
+
+
+@jax.jit
+def plain_residuals_of(scene: Scene, result: jaxik.Result) -> Array:
+    of_kinds = residuals.residuals_by_kind(scene, residuals.errors_by_kind(scene, result))
+    return jnp.concatenate([of_kind.ravel() for of_kind in of_kinds.values()])
 
 
 @pytest.mark.parametrize("loss", ["squares", "student"])
@@ -148,7 +154,7 @@ def test_blocks_have_the_likelihood_that_the_fit_has(problem, loss, correlation,
     problem = eqx.tree_at(
         lambda p: (p.data[0].sigmas.correlation, p.weight),
         problem,
-        (jnp.asarray(correlation), jnp.asarray(fraction)),
+        (jnp.full(6, correlation), jnp.asarray(fraction)),
     )
     posterior = draws_near_the_truth(problem, draws=8)
     values = replay(problem, posterior, seed=0).blocks.values
@@ -183,13 +189,13 @@ def test_blocks_last_their_time_and_those_without_any_observed_frame_are_left_ou
 ):
     of_blocks = replayed.blocks
     assert of_blocks.values.shape == (60, 2) and of_blocks.clip.tolist() == [1, 1]
-    assert of_blocks.start.tolist() == pytest.approx([0.0, 0.5])
-    assert of_blocks.end.tolist() == pytest.approx([0.5, 1.0])
-    observed = problem.data[0].reference.observed.at[15:].set(False)
+    assert of_blocks.start.tolist() == pytest.approx([0.0, 0.25], abs=1 / 30)
+    assert of_blocks.end.tolist() == pytest.approx([0.25, 0.5], abs=1 / 30)
+    observed = problem.data[0].reference.observed.at[7:].set(False)
     masked = eqx.tree_at(lambda p: p.data[0].reference.observed, problem, observed)
     half = replay(masked, draws_near_the_truth(problem, draws=8), seed=0)
     assert half.blocks.values.shape[1] == 1
-    assert np.isnan(half.bands[0].captured[15:]).all()
+    assert np.isnan(half.bands[0].captured[7:]).all()
 
 
 def test_the_digest_is_that_of_the_captured_motion(problem):
