@@ -84,7 +84,7 @@ def quick_ablation(folder: Path, patch: MonkeyPatch) -> Path:
     """An ablation whose fits take no time."""
     quick_fits(patch)
     without_pipeline(patch)
-    return write_ablation(folder)
+    return write_ablation(folder, rest=WITHOUT + GIVEN)
 
 
 # Calibration
