@@ -20,6 +20,7 @@ from fitting.experiment.systems import Preset
 from fitting.motion import playback
 from fitting.problem.scene import legs_ws, pelvis_ws
 from fitting.report.document import Grid, Text
+from fitting.runtime.program_cache import committed
 from fitting.studies import ablation, animations
 from fitting.studies.animations import AnimationFiles
 from fitting.studies.fit import fit_jobs
@@ -288,11 +289,9 @@ def test_the_cost_follows_the_track(tmp_path):
     moved, legs = pelvis_ws(scene, result), legs_ws(scene, result)
     reference = replace(scene.reference, pelvis=moved, knee_ws=legs.knee.pos, ankle=legs.ankle)
     scene = replace(scene, reference=reference)
-    tracks = {"pelvis.limit": np.full_like(scene.tracks["pelvis.limit"], 0.3)}
-    costs = [
-        replace(problem, data=(each,)).cost(truth)
-        for each in (scene, replace(scene, tracks=tracks))
-    ]
+    tracks = {"pelvis.limit": jnp.full_like(scene.tracks["pelvis.limit"], 0.3)}
+    both = committed([replace(problem, data=(s,)) for s in (scene, replace(scene, tracks=tracks))])
+    costs = [each.cost(truth) for each in both]
     assert costs[0] < 0.05, "only the prior's part is left"
     assert costs[1] > 1.0
 
@@ -355,7 +354,7 @@ def test_a_restricted_experiment_is_the_same_when_read_again_or_refused_if_it_co
 
 def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkeypatch):
     rest = "[start]\nfoot.max_pitch = 0.5\ntarget.rise_half_life = 0.1"
-    clip = "start = 1.0\nend = 1.5"
+    clip = "end = 2.97"  # as long as one that tests/studies/test_drafts.py runs: one program
     free = 'foot.max_pitch = {}\n"probe.toe_ls[1]" = {}\ntarget.rise_half_life = {}\n'
     experiment = restricted(tmp_path, rest=rest, free=free, clips=CLIP + clip)
     problem = make_problem(experiment)
