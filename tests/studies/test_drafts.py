@@ -14,7 +14,7 @@ import trimesh
 
 from fitting import jobs
 from fitting.cli import main
-from fitting.clips import load_clip, save_clip
+from fitting.clips import Clip, load_clip, save_clip
 from fitting.experiment import experiment_files, problems, systems
 from fitting.experiment.experiment import DEFAULT_SIGMAS, ClipEntry
 from fitting.experiment.problems import load_clip_data
@@ -41,13 +41,18 @@ def choose_few(ik, candidates, scenes):
     return [sensitivity.Forecast(name, name == "pelvis.limit", 1.0, 0.9) for name in candidates]
 
 
+def first_seconds(path: Path) -> Clip:
+    """Three of them."""
+    clip = load_clip(path)
+    return clip.select(slice(0, round(3 * clip.fps)))
+
+
 @pytest.fixture(scope="module")
 def drafted(tmp_path_factory) -> tuple[Path, str]:
     """A draft of three seconds of the uneven walk, and what the command printed."""
     folder = tmp_path_factory.mktemp("clips")
     for source in (WALK, BASE):
-        clip = load_clip(source)
-        save_clip(folder / source.name, clip.select(slice(0, round(3 * clip.fps))))
+        save_clip(folder / source.name, first_seconds(source))
     preset = Preset("record", faithful=True)
     request = DraftRequest((folder / WALK.name,), (GROUND,), (folder / BASE.name,), preset)
     lines: list[str] = []
@@ -105,7 +110,9 @@ def test_the_command_says_what_it_assumes(drafted):
 
 def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(draft, "choose_free", choose_few)
-    words = ["init", str(WALK), "--record-only", "-o", str(tmp_path / "walk")]
+    clip = first_seconds(WALK)
+    save_clip(tmp_path / WALK.name, clip)
+    words = ["init", str(tmp_path / WALK.name), "--record-only", "-o", str(tmp_path / "walk")]
     assert main.main(words) == 0
     text = capsys.readouterr().out
     assert text.startswith("no --terrain: the ground is reconstructed")
@@ -113,7 +120,6 @@ def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monke
     experiment = experiment_files.load_experiment(tmp_path / "walk" / draft.EXPERIMENT)
     (entry,) = experiment.clips
     assert entry.terrain == tmp_path / "walk" / "ground_uneven_walk.ply" and entry.base is None
-    clip = load_clip(WALK)
     feet = clip.joints_ws(3)[clip.stance_labels()][:, [0, 2]]
     reach = trimesh.load_mesh(entry.terrain, process=False).bounds[:, [0, 2]]
     np.testing.assert_allclose(reach, [feet.min(axis=0) - 2.0, feet.max(axis=0) + 2.0], atol=0.3)
