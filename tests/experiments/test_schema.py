@@ -13,6 +13,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+import jaxik
 from fitting.experiment import experiment, experiment_files, parameter_files, systems
 from fitting.experiment.experiment import (
     ALL_SIGMA_KEYS,
@@ -189,6 +190,24 @@ BEYOND_SCHEMA += [  # and about a free parameter's bounds, neither too narrow no
 @functools.cache
 def schema() -> Content:
     return experiment_schema()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def presets_made_once() -> Iterator[None]:
+    """Hundreds of experiments are read here: making their preset takes most of the time."""
+    systems_made: dict[str, jaxik.FootIK] = {}
+
+    def once(name: object, rig: None = None, *, faithful: object = False) -> jaxik.FootIK:
+        key = f"{name!r} {faithful!r}"
+        if key not in systems_made:
+            systems_made[key] = preset_system(name, rig, faithful=faithful)
+        return systems_made[key]
+
+    preset_system = systems.preset_system
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (systems, experiment_files):
+            patch.setattr(module, "preset_system", once)
+        yield
 
 
 def is_valid(toml: str) -> bool:
