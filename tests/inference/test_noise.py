@@ -329,7 +329,7 @@ def test_a_weight_does_not_move_the_best_fit(correlated, no_pipeline):
 def test_intervals_contain_the_truth_under_correlated_noise_of_another_size(
     correlated, no_pipeline
 ):
-    """The region of both parameters, of 200 draws of noise twice as large as its sigma."""
+    """The region of both parameters, of 120 draws of noise twice as large as its sigma."""
     problem = dataclasses.replace(only_ankles(correlated), loss="huber")
     (scene,), truth = problem.data, problem.space.start
     (errors,) = errors_by_kind(problem.space.unpack(truth), (scene,))
@@ -343,7 +343,7 @@ def test_intervals_contain_the_truth_under_correlated_noise_of_another_size(
         of_own = dataclasses.replace(problem, data=(own,))
         return of_own.residuals(u), jax.jacfwd(of_own.residuals)(u)
 
-    for _ in range(200):
+    for _ in range(120):
         noise = sigma * autoregression(random.normal(size=errors["ankle"].shape), 0.6)
         ankle = jnp.asarray(noise) - shift
 
