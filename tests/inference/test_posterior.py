@@ -118,7 +118,7 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     observed = jnp.where(moments > 0.43, 0.7, 0.0) + 0.3 * random.normal(size=25)
     problem = problem_of(Step(), ("height", "moment"), (moments, observed), step_residuals)
     start = problem.space.pack({"height": 0.7, "moment": 0.43})
-    sampled = sample(problem, start, np.array([0.3, 0.05]), walkers=32, stop_at=150.0)
+    sampled = sample(problem, start, np.array([0.3, 0.05]), walkers=32, stop_at=75.0)
     assert sampled.converged, sampled.message
 
     axes = jnp.linspace(-7, 7, 141), jnp.linspace(-7, 7, 1401)  # cliffs need the finer one
