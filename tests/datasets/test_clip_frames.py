@@ -32,7 +32,7 @@ def clip():
 @pytest.fixture(scope="module")
 def result(clip):
     ground = terrain.plane(normal=(0.0, 1.0, -0.15))
-    ik = parameter_tree.replace(jaxik.presets.record(), {"lean.forward_rate": 0.5})
+    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {"lean.forward_rate": 0.5})
     return jaxik.run(ik, clip.rig, ground, clip_frames.frames_from_clip(clip))
 
 
