@@ -26,9 +26,9 @@ import pytest
 from sybil import Example, Sybil
 from sybil.parsers import markdown
 
+import jaxik
 from fitting.cli.parser import make_parser
 from fitting.clips import load_clip
-import jaxik
 from fitting.experiment import experiment_files, track_files
 
 ROOT = Path(__file__).resolve().parents[1]
