@@ -421,8 +421,8 @@ def test_cells_lie_between_their_corners_and_quarter_turns_have_one_canonical_fo
 
 
 def test_an_unknown_grid_is_found(monkeypatch):
-    monkeypatch.setattr(reconstruction, "PITCHES", (0.35, 1.0))
-    monkeypatch.setattr(reconstruction, "COARSE_BEST", 8)
+    monkeypatch.setattr(reconstruction, "PITCHES", (0.35, 0.7))
+    monkeypatch.setattr(reconstruction, "COARSE_BEST", 4)
     angle = np.radians(-13.0)
     feet, rot = block_footprints(TILTED), reconstruction._uv_from_xz(angle).T
     heights, heading = block_heights(TILTED, feet.balls) + 1.0, TILTED.heading - angle
