@@ -207,11 +207,14 @@ def test_characters_that_a_stream_lacks_are_replaced(command, monkeypatch, capsy
     assert not printed.isascii()
 
 
+ORIGINAL = 'preset = "record"\nfaithful = true\n'  # compiles sooner than the preset
+
+
 def test_a_mistake_is_reported_and_nothing_written(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
     files |= {"bad.bvh": "hi", "bad.npz": "hi", "legs.toml": "foot.max_roll = [1, 2, 3]"}
-    files |= {"step.bvh": BVH, "mad.toml": "pelvis.tick_hz = -inf\nleg.soften = inf\n"}
+    files |= {"step.bvh": BVH, "mad.toml": f"{ORIGINAL}pelvis.tick_hz = -inf\nleg.soften = inf\n"}
     files |= {"broken.toml": "lock = [[", "odd.toml": "lock.max_speed = 'x'"}
     files["legless.bvh"] = BVH.replace("Left", "A").replace("Right", "B")
     for name, text in files.items():
@@ -256,7 +259,9 @@ def test_a_mistake_is_reported_and_nothing_written(tmp_path, capsys, monkeypatch
 
 def test_run_writes_the_motion_on_the_skeleton_that_came_in(tmp_path, capsys):
     (tmp_path / "step.bvh").write_text(BVH)
-    words = ["run", tmp_path / "step.bvh", "--terrain", GROUND, "-o"]
+    (tmp_path / "original.toml").write_text(ORIGINAL)
+    words = ["run", tmp_path / "step.bvh", "--terrain", GROUND]
+    words += ["--parameters", tmp_path / "original.toml", "-o"]
     outputs = {suffix: tmp_path / f"out{suffix}" for suffix in (".npz", ".bvh", ".csv")}
     for path in outputs.values():
         run(*words, path)
