@@ -7,7 +7,6 @@ the repository's root. Commands are checked by the command line's own parser, an
 """
 
 import contextlib
-import functools
 import importlib.util
 import io
 import os
@@ -26,7 +25,6 @@ import pytest
 from sybil import Example, Sybil
 from sybil.parsers import markdown
 
-import jaxik
 from fitting.cli.parser import make_parser
 from fitting.clips import load_clip
 from fitting.experiment import experiment_files, track_files
@@ -123,7 +121,6 @@ PAGE_PARSERS = [
 
 
 LONG = "jaxik/README.md"  # it differentiates all stages
-PLAYING = {"README.md", "jaxik/stages/README.md"}  # with the original record: it compiles sooner
 CASES = [
     pytest.param(path, id=name_of(path), marks=[pytest.mark.slow] * (name_of(path) == LONG))
     for path in PAGES
@@ -131,10 +128,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("path", CASES)
-def test_the_snippets_of_a_page_run(path, scratch, monkeypatch):
-    if name_of(path) in PLAYING:
-        faithful = functools.partial(jaxik.presets.record, faithful=True)
-        monkeypatch.setattr(jaxik.presets, "record", faithful)
+def test_the_snippets_of_a_page_run(path, scratch):
     for example in Sybil(PAGE_PARSERS).parse(path).examples():
         with contextlib.suppress(unittest.SkipTest):
             example.evaluate()
