@@ -107,12 +107,13 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
         return rot.apply((points - away).reshape(-1, 3)).reshape(points.shape)
 
     stride = frames.stride
-    stride = dataclasses.replace(
-        stride,
-        last_ws=turned(stride.last_ws),
-        next_ws=turned(stride.next_ws),
-        aside_ws=rot.apply(stride.aside_ws.reshape(-1, 3)).reshape(stride.aside_ws.shape),
-    )
+    ways = {
+        name: rot.apply(way.reshape(-1, 3)).reshape(way.shape)
+        for name in ("aside_ws", "last_ahead_ws", "next_ahead_ws")
+        if (way := getattr(stride, name)) is not None
+    }
+    points = {"last_ws": turned(stride.last_ws), "next_ws": turned(stride.next_ws)}
+    stride = dataclasses.replace(stride, **points, **ways)
     world = jaxik.Transform(
         jnp.asarray(turned(frames.world_from_model.pos)),
         jnp.asarray(quat.multiply(turn[None], frames.world_from_model.rot)),
