@@ -94,7 +94,8 @@ def rolling_walk() -> tuple[jaxik.Rig, jaxik.Frame]:
     clip = walker.walk(FRAMES / HZ, HZ, seed=3)
     ours = {name: getattr(RIG, name) for name in ("names", "joints", "pelvis")}
     frames = frames_from_clip(clip)
-    stride = dataclasses.replace(frames.stride, aside_ws=None)  # which other clips have not
+    ways = dict.fromkeys(("aside_ws", "last_ahead_ws", "next_ahead_ws"))  # other clips have none
+    stride = dataclasses.replace(frames.stride, **ways)
     return dataclasses.replace(clip.rig, **ours), dataclasses.replace(frames, stride=stride)
 
 
