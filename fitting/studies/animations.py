@@ -57,7 +57,7 @@ from .fit import run_folder
 # Frames: clips are played in a multiple of it, as each length is a program of its own, which takes
 # seconds to compile; a frame takes microseconds.
 PADDED = 128
-# Of ground that a probe accepts; `_binding_limit` tries each with these multiples, the least first.
+# Of ground that a probe accepts, and by how much `_binding_limit` raises one until feet stand.
 LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
 RAISED = (1.25, 1.5, 2.0, 3.0)
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
@@ -246,18 +246,24 @@ class Animation:
         """The limit of a system that refuses ground on which feet would stand, if one does."""
         if not (isinstance(ik.probe, AbstractLimitedProbe) and ik.probe.limited):
             return None
+
+        def with_limit(name: str, factor: float) -> jaxik.FootIK:
+            return parameter_tree.replace(ik, {name: factor * parameter_tree.get(ik, name)})
+
+        def helps(name: str, factor: float) -> bool:
+            try:
+                _, solved = self.solve(with_limit(name, factor))  # by the same program
+            except ValueError:  # poses that are not finite
+                return False
+            return measures.is_much_closer(self.soles(solved), motion.soles)
+
         for name in LIMITS_OF_GROUND:
-            for factor in RAISED:  # the same program with another number
-                raised_ik = parameter_tree.replace(
-                    ik, {name: factor * parameter_tree.get(ik, name)}
+            if helps(name, RAISED[-1]):
+                factor = next(factor for factor in RAISED if helps(name, factor))
+                accepting = parameter_tree.shown(with_limit(name, factor), name)
+                return measures.Cause(
+                    "limit", limit=(name, parameter_tree.shown(ik, name), accepting)
                 )
-                try:
-                    solved = self.solve(raised_ik)[1]
-                except ValueError:  # poses that are not finite
-                    continue
-                if measures.is_much_closer(self.soles(solved), motion.soles):
-                    refusing, accepting = (parameter_tree.shown(x, name) for x in (ik, raised_ik))
-                    return measures.Cause("limit", limit=(name, refusing, accepting))
         return None
 
     def _soles_without(self, cause: measures.Cause) -> measures.Soles | None:
