@@ -133,7 +133,7 @@ def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 @jax.jit
 def safe_divide(
-    numerator: Float[Array, "*a"], denominator: Float[Array, "*b"], otherwise: float = 0.0
+    numerator: Float[Array, "*a"], denominator: Float[Array, "*b"], otherwise: float | Array = 0.0
 ) -> Array:
     """Quotient; `otherwise`, with zero gradient, where the denominator is almost 0."""
     nonzero = jnp.abs(denominator) >= jnp.finfo(denominator.dtype).tiny
