@@ -25,6 +25,7 @@ from reference.terrain import Terrain as PlainTerrain
 from support import cases, clips
 from support.cases import QUICK, Either, stacked
 from support.clips import BROKEN, FLAT, FRAMES, HZ, ODD, at, to_ik, to_rig
+from support.strides import WAYS
 
 EXACT = 1e-9  # m, and length of the difference of unit quaternions
 JOINTS = ("hip", "knee", "ankle", "toe")
@@ -94,8 +95,7 @@ def rolling_walk() -> tuple[jaxik.Rig, jaxik.Frame]:
     clip = walker.walk(FRAMES / HZ, HZ, seed=3)
     ours = {name: getattr(RIG, name) for name in ("names", "joints", "pelvis")}
     frames = frames_from_clip(clip)
-    ways = dict.fromkeys(("aside_ws", "last_ahead_ws", "next_ahead_ws"))  # other clips have none
-    stride = dataclasses.replace(frames.stride, **ways)
+    stride = dataclasses.replace(frames.stride, **dict.fromkeys(WAYS))  # other clips have none
     return dataclasses.replace(clip.rig, **ours), dataclasses.replace(frames, stride=stride)
 
 

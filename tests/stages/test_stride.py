@@ -28,8 +28,8 @@ from support.cases import RIG
 from support.clips import animate, assert_close, at, to_frames, to_ik, to_terrain
 from support.gradients import finite_jacobian
 from support.probing import BLOCKS, ground_under, level_blocks, quad
-from support.stride_runs import FLAT, WAYS, of_legs, on_platform, solved
-from support.strides import blocks, walk
+from support.stride_runs import FLAT, of_legs, on_platform, solved
+from support.strides import WAYS, blocks, walk
 
 FLOORS, HZ = of_legs(FLAT), 25.0
 

@@ -21,6 +21,7 @@ from fitting.synthetic.footsteps import SIDES, Foothold, Swing, stepping_foot
 from jaxik.maths import quat, vec
 from stairs import flights
 from stairs.flights import Flight
+from support.strides import WAYS
 
 FPS, FRAMES = 60, 200
 SECONDS = 9.0
@@ -109,8 +110,7 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
     stride = frames.stride
     ways = {
         name: rot.apply(way.reshape(-1, 3)).reshape(way.shape)
-        for name in ("aside_ws", "last_ahead_ws", "next_ahead_ws")
-        if (way := getattr(stride, name)) is not None
+        for name, way in ((name, getattr(stride, name)) for name in WAYS)
     }
     points = {"last_ws": turned(stride.last_ws), "next_ws": turned(stride.next_ws)}
     stride = dataclasses.replace(stride, **points, **ways)

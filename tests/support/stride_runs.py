@@ -20,7 +20,6 @@ from .probing import quad
 from .strides import blocks
 
 FRAMES = 100
-WAYS = ("aside_ws", "last_ahead_ws", "next_ahead_ws")  # of strides, which may be None
 TRIANGLES = 120  # of each ground
 compiled = jax.jit(jaxik.run, compiler_options=QUICK)
 
@@ -49,7 +48,7 @@ def solved(
 ) -> jaxik.Result:
     """What the preset with these values makes of a clip; each leg has its numbers.
 
-    The frames have all `WAYS` of strides, and a platform, on which the ground is.
+    The frames have all ways of strides, and a platform, on which the ground is.
     """
     ik = to_ik(values, "stride")
     shared = {x.name: x.value for x in slots(ik) if x.per_leg and x.value.shape == x.shape}

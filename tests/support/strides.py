@@ -11,6 +11,7 @@ from reference.characters import Frame, Rig, Stride
 from reference.maths import Transform
 from reference.terrain import Terrain
 
+WAYS = ("aside_ws", "last_ahead_ws", "next_ahead_ws")  # of strides, which may be None
 HZ = 60.0
 SPEED = 0.9  # m/s
 CYCLE = 1.0  # s
