@@ -267,10 +267,9 @@ def _extremes(surface: object) -> Points:
     """Two corners of the box around a surface, m."""
     match surface:
         case Mesh():
-            points = np.asarray(surface.vertices_ws, np.float64)[np.asarray(surface.triangles)]
-            points = points.reshape(-1, 3)
-            offset = 0.0 if surface.offset_ws is None else np.asarray(surface.offset_ws)
-            return np.stack([points.min(axis=0), points.max(axis=0)]) + offset
+            vertices, triangles, _ = surface.on_host()
+            points = vertices[triangles.reshape(-1)].astype(np.float64)
+            return np.stack([points.min(axis=0), points.max(axis=0)])
         case Heightfield():
             heights = np.asarray(surface.heights, np.float64)
             rows, columns = heights.shape

@@ -20,6 +20,7 @@ from fitting.clips import contacts
 from fitting.clips.clip import Clip
 from fitting.clips.clip_frames import raised
 from jaxik.world import body
+from jaxik.world.grid import padded
 from jaxik.world.terrain import HORIZON, Terrain, cast
 
 Root = Literal["auto", "animation", "ground"]
@@ -122,7 +123,9 @@ def path_heights(
         starts[piece.start] = next(iter(start[~np.isnan(start)]), np.nan)
     starts[0] = next(iter(starts[~np.isnan(starts)]))
     fall = FALL * body.ratio(clip.rig) ** 0.5 / clip.fps
-    return np.asarray(_followed(terrain, jnp.asarray(points), jnp.asarray(starts), step, fall))
+    # Paths of different lengths share a program.
+    arrays = jnp.asarray(padded(points, points[-1])), jnp.asarray(padded(starts, np.nan))
+    return np.asarray(_followed(terrain, *arrays, step, fall))[: len(points)]
 
 
 def step_height(clip: Clip) -> float:

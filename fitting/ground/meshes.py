@@ -396,10 +396,8 @@ def mesh_of(terrain: Terrain) -> Mesh:
 
 def _mesh_of_surface(surface: surfaces.AbstractSurface) -> Mesh:
     if isinstance(surface, surfaces.Mesh):
-        vertices = np.asarray(surface.vertices_ws, np.float64)
-        if surface.offset_ws is not None:
-            vertices = vertices + np.asarray(surface.offset_ws)
-        return Mesh(vertices, np.asarray(surface.triangles, np.int64))
+        vertices, triangles, _ = surface.on_host()
+        return Mesh(vertices.astype(np.float64), triangles.astype(np.int64))
     if not isinstance(surface, Heightfield):
         raise ValueError(f"a {type(surface).__name__} has no triangles; wanted a mesh")
     heights = np.asarray(surface.heights, np.float64)

@@ -361,8 +361,7 @@ def _path(live: LiveClip) -> tuple[np.ndarray, float]:
 
 def _pack_mesh(mesh: Mesh, live: LiveClip, corner: np.ndarray) -> Content:
     path, margin = _path(live)
-    offset = 0.0 if mesh.offset_ws is None else np.asarray(mesh.offset_ws)
-    vertices, triangles = np.asarray(mesh.vertices_ws) + offset, np.asarray(mesh.triangles)
+    vertices, triangles, layers = mesh.on_host()
     near = _near(vertices[:, [0, 2]][triangles], path, margin)
     if near.sum() > MAX_TRIANGLES:
         raise NotLiveError(f"the ground near its path has {near.sum():,} triangles")
@@ -373,7 +372,7 @@ def _pack_mesh(mesh: Mesh, live: LiveClip, corner: np.ndarray) -> Content:
         "high": (path.max(axis=0) + margin - corner[[0, 2]]).tolist(),
         "vertices": packed_table(vertices[used] - corner),
         "triangles": packed(corners.astype("<u4")),
-        "layers": packed(np.asarray(mesh.layers)[near].astype("<u4")),
+        "layers": packed(layers[near].astype("<u4")),
     }
 
 

@@ -4,6 +4,9 @@ Built once with NumPy, searched in JAX. The plane of the grid is at right angles
 where a ray crosses it decides the cell, and each cell lists its triangles. There are up to twice as
 many cells as triangles. Cells that are still crowded are split four by four, repeatedly as long as
 that thins their lists, so that an uneven mesh needs neither long lists nor a fine grid everywhere.
+
+All arrays have one of a few lengths (`padded`): ends that nothing reads let meshes of different
+sizes share a compiled program.
 """
 
 import equinox as eqx
@@ -16,6 +19,17 @@ from jaxik.maths import vec
 
 from . import cells
 from .cells import SPLIT
+
+LEAST, STEP = 512, 1 << 16  # lengths of arrays: powers of two between them, then steps
+CELLS, ENTRIES = 4, 8  # per triangle, for which most meshes have room
+
+
+def padded(rows: np.ndarray, fill: ArrayLike, least: int = LEAST) -> np.ndarray:
+    """Rows and then as many of `fill` as make one of a few lengths, which is `least` or more."""
+    length = max(len(rows), least, LEAST)
+    length = -(-length // STEP) * STEP if length > STEP else 1 << (length - 1).bit_length()
+    end = np.full((length - len(rows), *rows.shape[1:]), fill, rows.dtype)
+    return np.concatenate([rows, end])
 
 
 class Grid(eqx.Module):
@@ -33,13 +47,13 @@ class Grid(eqx.Module):
     """m, x and z of the first cell's corner."""
     pitch: Float[Array, "*t"]
     """m, side of an unsplit cell."""
-    first: Int[Array, "*t cells_and_end"]
+    first: Int[Array, "*t cells_and_more"]
     """Start of each cell's list in `members`."""
     children: Int[Array, "*t cells"]
     """First part of a split cell, -1 where not split."""
     members: Int[Array, "*t entries"]
     """Triangles, cell by cell."""
-    shape: tuple[int, int] = eqx.field(static=True)
+    shape: Int[Array, "*t 2"]
     """Unsplit cells along x and z."""
     depth: int = eqx.field(static=True)
     """Levels of split cells."""
@@ -63,7 +77,8 @@ class Grid(eqx.Module):
         The length is 0 outside the grid and for NaN.
         """
         across, along = (x - self.corner[0]) / self.pitch, (z - self.corner[1]) / self.pitch
-        inside = (across >= 0) & (across < self.shape[0]) & (along >= 0) & (along < self.shape[1])
+        rows, columns = self.shape.astype(self.corner.dtype)
+        inside = (across >= 0) & (across < rows) & (along >= 0) & (along < columns)
         across, along = jnp.where(inside, across, 0.0), jnp.where(inside, along, 0.0)
         row, column = jnp.floor(across), jnp.floor(along)
         cell = row.astype(jnp.int32) * self.shape[1] + column.astype(jnp.int32)
@@ -184,7 +199,7 @@ def build(
     Args:
         vertices_ws: m.
         triangles: indices of vertices, in either winding.
-        layers: one bit each.
+        layers: one bit each, none for triangles that only fill the arrays.
         up_ws: unit.
         slack: how far a vertex may later move sideways with its triangles still found, m.
     """
@@ -196,7 +211,7 @@ def build(
     # Looked up, the place of a ray is rounded in proportion to its size.
     pad = slack + 32 * float(np.finfo(plan.dtype).eps) * float(np.abs(plan).max())
     # A wall can only be hit after its corners have moved sideways.
-    listed = np.ones(len(plan), bool) if slack > 0 else ~np.asarray(wall)
+    listed = np.asarray(layers) > 0 if slack > 0 else ~np.asarray(wall)
     lists = cells.build(plan.astype(np.float64), listed, pad)
     return Grid(
         centre_ws=centre_ws,
@@ -205,10 +220,10 @@ def build(
         visible=_as_jax(np.where(wall, 0, layers), np.uint32),
         corner=_as_jax(lists.corner, plan.dtype),
         pitch=_as_jax(lists.pitch, plan.dtype),
-        first=_as_jax(lists.first, np.int32),
-        children=_as_jax(lists.children, np.int32),
-        members=_as_jax(lists.members, np.int32),
-        shape=lists.shape,
+        first=_as_jax(padded(lists.first, lists.first[-1], CELLS * len(plan)), np.int32),
+        children=_as_jax(padded(lists.children, -1, CELLS * len(plan)), np.int32),
+        members=_as_jax(padded(lists.members, 0, ENTRIES * len(plan)), np.int32),
+        shape=_as_jax(lists.shape, np.int32),
         depth=lists.depth,
     )
 

@@ -6,11 +6,12 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from jaxik.maths import vec
 
-from .grid import Grid
+from .grid import Grid, build, padded
 from .skeleton import Transform
 
 STATIC = -1  # the platform of what never moves
@@ -76,6 +77,10 @@ class Mesh(AbstractSurface):
 
     Watertight: no ray passes through an edge or a corner that triangles share. A triangle that
     contains up (a wall) or has no area is never hit, since a ray along it has no single answer.
+
+    Arrays have one of a few lengths, so that meshes of different sizes share compiled programs.
+    What fills them up, copies of a vertex and triangles without area on no layer, is never hit;
+    `on_host` leaves it out.
     """
 
     vertices_ws: Float[Array, "*t vertices 3"]  # m
@@ -84,6 +89,39 @@ class Mesh(AbstractSurface):
     grid: Grid
     offset_ws: Float[Array, "*t 3"] | None = None
     """m, to be added to vertices and grid; None for nothing."""
+
+    @classmethod
+    def build(
+        cls,
+        vertices_ws: Float[np.ndarray, "vertices 3"],
+        triangles: Int[np.ndarray, "triangles 3"],
+        layers: UInt[np.ndarray, " triangles"],
+        up_ws: Float[Array, "3"],
+        slack: float = 0.0,
+    ) -> "Mesh":
+        """A mesh of arrays on the host, and its grid; see `jaxik.terrain.mesh`."""
+        faces = padded(triangles.astype(np.int32), triangles[0, 0])
+        arrays = (
+            jnp.asarray(padded(vertices_ws, vertices_ws[0], len(faces))),
+            jnp.asarray(faces),
+            jnp.asarray(padded(layers.astype(np.uint32), 0)),
+        )
+        return cls(*arrays, build(*arrays, up_ws, slack))
+
+    def on_host(
+        self,
+    ) -> tuple[
+        Float[np.ndarray, "vertices 3"],
+        Int[np.ndarray, "triangles 3"],
+        UInt[np.ndarray, " triangles"],
+    ]:
+        """Vertices where they have moved to, m, triangles and their layers."""
+        layers = np.asarray(self.layers)
+        triangles = np.asarray(self.triangles)[layers > 0]
+        vertices_ws = np.asarray(self.vertices_ws)[: triangles.max() + 1]
+        if self.offset_ws is not None:
+            vertices_ws = vertices_ws + np.asarray(self.offset_ws)
+        return vertices_ws, triangles, layers[layers > 0]
 
     def moved(self, by_ws: Float[Array, "3"]) -> "Mesh":
         offset_ws = by_ws if self.offset_ws is None else self.offset_ws + by_ws
@@ -99,7 +137,17 @@ class Mesh(AbstractSurface):
         The grid is kept. It finds every triangle as long as no vertex has moved further sideways
         (at right angles to up) than the `slack` that the mesh was built with; movement along up is
         unlimited. Beyond that, a ray may miss a moved triangle.
+
+        Raises:
+            ValueError: more vertices than the mesh has.
         """
+        missing = len(self.vertices_ws) - len(vertices_ws)
+        if missing < 0:
+            raise ValueError(
+                f"the mesh has at most {len(self.vertices_ws)} vertices; got {len(vertices_ws)}"
+            )
+        ends = jnp.broadcast_to(vertices_ws[:1], (missing, 3))
+        vertices_ws = jnp.concatenate([vertices_ws, ends])
         triangles, layers = self.triangles, self.layers
         grid = self.grid.with_vertices(vertices_ws, triangles, layers)
         return Mesh(vertices_ws, triangles, layers, grid, self.offset_ws)

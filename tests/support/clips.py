@@ -160,27 +160,9 @@ def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
         vertices = np.asarray(ground.triangles).reshape(-1, 3)
         triangles = np.arange(len(vertices)).reshape(-1, 3)
         layers = np.asarray(ground.triangle_layers)
-        mesh = terrain.mesh(vertices, triangles, up=ground.up, layer=layers)
-        surfaces.append(in_one_cell(mesh))
+        surfaces.append(terrain.mesh(vertices, triangles, up=ground.up, layer=layers))
     combined = terrain.combine(*surfaces)
     return combined if ground.platform < 0 else terrain.moving(combined, ground.platform)
-
-
-def in_one_cell(mesh: terrain.Terrain) -> terrain.Terrain:
-    """The mesh with a grid of one cell: with as many triangles, all share a program."""
-    surface: Any = mesh.surfaces[0]
-    grid = surface.grid
-    everything = dataclasses.replace(
-        grid,
-        corner=jnp.full_like(grid.corner, -1e4),
-        pitch=jnp.full_like(grid.pitch, 2e4),
-        first=jnp.array([0, len(surface.triangles)], grid.first.dtype),
-        children=jnp.array([-1], grid.children.dtype),
-        members=jnp.arange(len(surface.triangles), dtype=grid.members.dtype),
-        shape=(1, 1),
-        depth=0,
-    )
-    return dataclasses.replace(mesh, surfaces=(dataclasses.replace(surface, grid=everything),))
 
 
 def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:

@@ -71,12 +71,9 @@ def mesh(
     positions, corners = np.asarray(vertices), np.asarray(triangles)
     arguments.check_mesh(positions, corners)
     up_ws = arguments.direction(up, "up", dtype)
-    surface = (
-        jnp.asarray(positions.astype(dtype), dtype),  # by NumPy: JAX would compile a cast
-        jnp.asarray(corners.astype(np.int32), np.int32),
-        jnp.asarray(np.broadcast_to(arguments.layer_bits(layer), len(corners)), np.uint32),
-    )
-    return Terrain(up_ws, (Mesh(*surface, grid.build(*surface, up_ws, slack)),))
+    # Cast by NumPy: JAX would compile a program for it.
+    bits = np.broadcast_to(arguments.layer_bits(layer), len(corners))
+    return Terrain(up_ws, (Mesh.build(positions.astype(dtype), corners, bits, up_ws, slack),))
 
 
 def heightfield(
@@ -213,15 +210,12 @@ def merge(
             if not isinstance(surface, Mesh):
                 raise ValueError(f"only static meshes merge; got a {type(surface).__name__}")
             moved = surface.moved(jnp.asarray(offset_ws, surface.vertices_ws.dtype))
-            vertices.append(np.asarray(moved.vertices_ws) + np.asarray(moved.offset_ws))
-            triangles.append(np.asarray(surface.triangles) + count)
-            layers.append(np.asarray(surface.layers))
-            count += len(vertices[-1])
-    corners, members, bits = (
-        jnp.asarray(np.concatenate(parts)) for parts in (vertices, triangles, layers)
-    )
-    lists = grid.build(corners, members, bits, up_ws, slack=0.0)
-    return Terrain(up_ws, (Mesh(corners, members, bits, lists),))
+            corners, members, bits = moved.on_host()
+            vertices.append(corners)
+            triangles.append(members + count)
+            layers.append(bits)
+            count += len(corners)
+    return Terrain(up_ws, (Mesh.build(*map(np.concatenate, (vertices, triangles, layers)), up_ws),))
 
 
 def moving(terrain: Terrain, platform: int, tilts: bool = False) -> Terrain:
