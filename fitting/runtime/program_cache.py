@@ -32,11 +32,13 @@ from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
 from jax.core import Tracer
 from jaxtyping import PyTree
 
 import jaxik
+from jaxik.world.terrain import Terrain
 
 from . import activity, cache_folder, files, plain_tree
 from .cache_folder import setting, warn_once
@@ -44,6 +46,7 @@ from .plain_tree import NotPlainError
 from .validation import in_one_line
 
 MAGIC = b"jaxik program 1\n"
+LENGTH = 128  # frames
 # How JAX names calls from a program back into Python; no program of this project has one.
 CALLBACK = re.compile(rb"python_\w*callback")
 
@@ -329,4 +332,35 @@ def _trace(function: Callable, arguments: Arguments) -> Program:
     return Program(exported, outputs[-1])
 
 
-run = cached(jaxik.run)
+_run = cached(jaxik.run)
+
+
+def run(
+    ik: jaxik.FootIK,
+    rig: jaxik.Rig,
+    terrain: Terrain,
+    frames: jaxik.Frame,
+    tracks: Mapping[str, jax.Array] | None = None,
+) -> jaxik.Result:
+    """`jaxik.run`, by a program that it shares with clips of other lengths; NumPy arrays."""
+    count = len(frames.dt)
+    frames, tracks = padded((frames, tracks))
+    result = jax.device_get(_run(ik, rig, terrain, frames, tracks=tracks))
+    return jax.tree.map(lambda x: x[:count], result)
+
+
+def padded(tree: Tree) -> Tree:
+    """Arrays along the frames of a clip with more of its last frame, which change none before it.
+
+    They are as long as a multiple of `LENGTH`: each length is a program of its own, which takes
+    seconds to compile, and a frame takes microseconds.
+    """
+
+    def pad(x: jax.Array) -> jax.Array:
+        more = -len(x) % LENGTH
+        if not more:
+            return x
+        x = np.asarray(x)
+        return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
+
+    return jax.tree.map(pad, tree)

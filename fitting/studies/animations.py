@@ -54,9 +54,6 @@ from jaxik.world.terrain import Terrain, moving
 
 from .fit import run_folder
 
-# Frames: clips are played in a multiple of it, as each length is a program of its own, which takes
-# seconds to compile; a frame takes microseconds.
-PADDED = 128
 # Of ground that a probe accepts, and by how much `_binding_limit` raises one until feet stand.
 LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
 RAISED = (1.25, 1.5, 2.0, 3.0)
@@ -172,17 +169,12 @@ class Animation:
         rig, terrain, frames, tracks = self._inputs
         result = program_cache.run(ik, rig, terrain, frames, tracks=tracks or None)
         count = len(self.frames.dt)
-        return jax.tree.map(lambda x: x[:count], jax.device_get(result))
+        return jax.tree.map(lambda x: x[:count], result)
 
     @cached_property
     def _inputs(self) -> tuple[jaxik.Rig, Terrain, jaxik.Frame, dict[str, Array]]:
         """What does not depend on the system; frames and tracks as long as they are played."""
-        repeats = -len(self.frames.dt) % PADDED  # of the last frame: nothing before them changes
-
-        def pad(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([x, np.repeat(x[-1:], repeats, axis=0)])
-
-        padded = jax.tree.map(pad, jax.device_get((self.frames, dict(self.tracks))))
+        padded = program_cache.padded((self.frames, dict(self.tracks)))
         arrays = jax.tree.map(jnp.asarray, padded)
         return program_cache.committed((self.clip.rig, self.terrain, *arrays))
 

@@ -22,6 +22,7 @@ from fitting.motion import measures
 from fitting.motion.flat_animation import load_flat_animation
 from fitting.motion.measures import MEASURES
 from fitting.report import pages, style
+from fitting.runtime import program_cache
 from fitting.studies import animations, comparison
 from fitting.studies.animations import Animation, every_frame, measure
 from fitting.synthetic import walker
@@ -131,7 +132,7 @@ def test_clips_are_played_in_few_lengths_and_get_results_of_their_own(folder, mo
         lengths.append(len(frames.dt))
         return frames, tracks
 
-    monkeypatch.setattr(animations.program_cache, "run", play)
+    monkeypatch.setattr(program_cache, "_run", play)
     walk = clips.load_clip(folder / "walk.npz")
     for count in (20, 60):
         part = edit.trim(walk, 0.0, count / walk.fps)
@@ -141,7 +142,7 @@ def test_clips_are_played_in_few_lengths_and_get_results_of_their_own(folder, mo
         frames, tracks = result
         np.testing.assert_array_equal(frames.pose.ankle.pos, animation.frames.pose.ankle.pos)
         np.testing.assert_array_equal(tracks["leg.weight"], weights["leg.weight"])
-    assert lengths == [animations.PADDED] * 2
+    assert lengths == [program_cache.LENGTH] * 2
 
 
 def test_a_walk_neither_sinks_nor_floats_on_ground_at_the_height_of_its_floor(folder):
