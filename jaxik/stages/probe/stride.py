@@ -294,7 +294,8 @@ class StrideProbe(AbstractSupportedProbe):
         below = self.below_others(inputs, height, normal, found)
         stair = _least_step(evened, path.found, jnp.abs)
         step = jnp.where(step > stair, stair, jnp.where(step < -stair, -stair, step))
-        swing = self.swing(inputs, stride, step, over, trust, below)
+        ahead = self.above_others(inputs, high - slope, height, found)
+        swing = self.swing(inputs, stride, step, ahead, over, trust, below)
         height += self.clearance_over_edges(inputs, stride, swing, foot_height, edge)
         share = trust * fraction
         parts = jnp.stack([1.0 - share, share]) * heels.found

@@ -61,7 +61,9 @@ class AbstractSwingProbe(AbstractLimitedProbe):
 
     People who step up, down or over something lift a foot later than on the flat, but higher, and
     point their toes to the ground on which they will land. How much, follows from the step's height
-    and from how far the ground on the way stands over both footholds. Each part is a bump over the
+    and from how far the ground on the way stands over both footholds. A foot that follows the other
+    up is lifted most; what leads beyond the other foot's ground, the less the higher it is, and on
+    the highest steps not at all. Each part is a bump over the
     time of the swing, `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape
     was read off a captured walk over blocks; where the ground is as even as in the animation
     nothing is added. Steps higher than `highest_step`, the highest of that walk, add no more than
@@ -93,7 +95,12 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         0.15,
         "How much higher than animated a foot passes the middle of a step on uneven ground.",
     )
-    lift_per_rise: Leaf = ratio(0.5, 0, 1.5, "Height added to a step up, per height of the step.")
+    lift_per_rise: Leaf = ratio(
+        0.5, 0, 1.5, "Height added to a step up to the other foot's ground, per height of the step."
+    )
+    lift_ahead: Leaf = ratio(
+        0.85, 0, 2, "Height added to a step up from there on, per height; the less, the higher."
+    )
     lift_per_fall: Leaf = ratio(
         0.35, 0, 1.5, "Height added to a step down, early, per height of the step."
     )
@@ -138,6 +145,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         inputs: Inputs,
         stride: Stride,
         step: Array,
+        ahead: Array,
         over: Array,
         trust: Array,
         below: Array,
@@ -148,6 +156,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
             inputs: the frame.
             stride: where the feet are in it.
             step: by how much the next foothold is higher than the last, m, without the slope.
+            ahead: by how much it is higher than other feet too, m.
             over: how far the ground on the way is over both, m.
             trust: 0..1, how far the next foothold is accepted.
             below: how far each foot's ground is below that of another foot, m.
@@ -160,7 +169,10 @@ class AbstractSwingProbe(AbstractLimitedProbe):
             self.toe_clearance * bump(x, CLEAR)
             - self.held_lift * self._animated_lift(inputs) * bump(x, HELD)
         )
-        lift += self.lift_per_rise * rise * bump(x, RISE)
+        ahead = jnp.where(ahead < rise, ahead, rise)
+        low = 1.0 - vec.safe_divide(ahead, self.highest_step)
+        high = self.lift_per_rise * (rise - ahead) + self.lift_ahead * ahead * low
+        lift += high * bump(x, RISE)
         lift += self.lift_per_fall * fall * bump(x, FALL)
         lift += self.lift_over * over * bump(x, OVER)
         down = uneven * self.toes_down + self.toes_down_per_height * total
@@ -216,6 +228,21 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         bears = jnp.broadcast_to(inputs.bearing, found.shape)
         below = jnp.where(counts & (rise - slope > 0), rise - slope, 0.0)
         return jnp.max(bears * bears[:, None] * below, axis=-1)
+
+    def above_others(
+        self, inputs: Inputs, next_height: Array, height: Array, found: Array
+    ) -> Float[Array, " legs"]:
+        """How far each next foothold is above the ground of all other feet, m.
+
+        Args:
+            inputs: the frame.
+            next_height: of the next foothold, m.
+            height: of the ground under each ball, m.
+            found: of that ground; where it is 0, as of absent legs, a foot is above it.
+        """
+        others = ~jnp.eye(len(height), dtype=bool) & (found > 0) & inputs.rig.present
+        highest = jnp.max(jnp.where(others, height, -FAR), axis=-1)
+        return jnp.where(next_height > highest, next_height - highest, 0.0)
 
     def highest(self, inputs: Inputs, heights: Array, found: Array) -> Float[Array, " legs"]:
         """The highest of heights of the ground on the way (points legs), m; 0 if all are below.

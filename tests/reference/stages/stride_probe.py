@@ -34,7 +34,8 @@ SHARPNESS = 7.0
 UNEVEN = 0.05  # m
 HIGHEST = 0.3  # m, of the steps that people were captured on
 ON_HEEL = 0.08  # rad
-HELD, CLEAR, RISE, FALL, OVER, TOES_UP, TOES_DOWN = 0.28, 0.55, 0.52, 0.31, 0.455, 0.23, 0.75
+HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
+TOES_UP, TOES_DOWN = 0.23, 0.75
 
 
 @dataclass
@@ -88,6 +89,7 @@ class UnderBall:
     heel_rise: float = 0.0
     heel_found: float = 0.0
     end_height: float = 0.0
+    next_height: float = 0.0
     step: float = 0.0
     over: float = 0.0
     edge: float = 0.0
@@ -292,7 +294,7 @@ def under_ball(leg: Leg, stride: Swing) -> UnderBall:
     plane = climb(leg, normal, arm)
     heel = look(leg, level(leg, stride.next + arm))
     end = high + (shared_rise(plane, height(leg, heel.point) - high) if heel.found else plane)
-    under = ground, normal, heel_rise, heel_found, end
+    under = ground, normal, heel_rise, heel_found, end, high - slope
     return UnderBall(stride, found, *under, step, over, edge, sure * arrives, platform)
 
 
@@ -316,16 +318,23 @@ def below_others(leg: Leg, legs: list[Leg], balls: list[UnderBall]) -> float:
     return below
 
 
-def ground_of_stride(leg: Leg, ball: UnderBall, below: float) -> tuple[Hit, Swing]:
+def above_others(leg: Leg, balls: list[UnderBall]) -> float:
+    """How far the next foothold is above the ground of all other feet, m, without its slope."""
+    others = [ball.height for ball in balls if ball is not balls[leg.index] and ball.found]
+    return max(balls[leg.index].next_height - max(others, default=-math.inf), 0.0)
+
+
+def ground_of_stride(leg: Leg, ball: UnderBall, below: float, above: float) -> tuple[Hit, Swing]:
     """The ground under the ankle of a leg, and its swing.
 
-    `below` is how far its ground is below that of another foot, m.
+    `below` is how far its ground is below that of another foot, m, and `above` how far its next
+    foothold is above the ground of all others.
     """
     ankle, ball_ws, stride = leg.pos_ws("ankle"), leg.pos_ws("toe"), ball.stride
     here = level(leg, ankle)
     if not ball.found:
         return Hit(False, here, leg.up), stride
-    lift, pitch = beyond_animation(leg, ball, below)
+    lift, pitch = beyond_animation(leg, ball, below, above)
 
     def lift_over_edges() -> float:
         """How far the ground must be raised for the animated sole to clear what is on its path."""
@@ -413,10 +422,11 @@ def axis_of_pitch(leg: Leg) -> Array:
     return cross(leg.heading_ws, leg.up)
 
 
-def beyond_animation(leg: Leg, ball: UnderBall, below: float) -> tuple[float, float]:
+def beyond_animation(leg: Leg, ball: UnderBall, below: float, above: float) -> tuple[float, float]:
     """How much higher the ankle is, m, and how much further the toes are up, rad.
 
-    `below` is how far the ground of this foot is below that of another, m.
+    `below` is how far the ground of this foot is below that of another, m, and `above` how far its
+    next foothold is above the ground of all others.
     """
     if leg["probe.swing_as_animated"]:
         return 0.0, 0.0
@@ -427,7 +437,9 @@ def beyond_animation(leg: Leg, ball: UnderBall, below: float) -> tuple[float, fl
     uneven = smooth01(effort / UNEVEN)
     lift = uneven * leg["probe.toe_clearance"] * bump(fraction, CLEAR)
     lift -= uneven * leg["probe.held_lift"] * animated * bump(fraction, HELD)
-    lift += leg["probe.lift_per_rise"] * max(step, 0.0) * bump(fraction, RISE)
+    ahead = min(above, max(step, 0.0))
+    lift += leg["probe.lift_per_rise"] * (max(step, 0.0) - ahead) * bump(fraction, RISE)
+    lift += leg["probe.lift_ahead"] * ahead * (1.0 - ahead / HIGHEST) * bump(fraction, RISE)
     lift += leg["probe.lift_per_fall"] * max(-step, 0.0) * bump(fraction, FALL)
     lift += leg["probe.lift_over"] * ball.over * bump(fraction, OVER)
     down = uneven * leg["probe.toes_down"] + effort * leg["probe.toes_down_per_height"]
