@@ -249,7 +249,9 @@ def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
         lean=SpineLean(pelvis_rate=body.pitch_rate(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
-        pelvis=ReachPelvis(landing_time=0.12, rise_half_life=0.1, fall_half_life=0.04, spring=True),
+        pelvis=ReachPelvis(
+            landing_time=0.12, rise_half_life=0.07, fall_half_life=0.04, spring=True
+        ),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
         foot=SlopeFoot(),

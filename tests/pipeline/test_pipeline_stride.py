@@ -22,7 +22,9 @@ ODD: dict[str, Any] = (  # away from the defaults
     | named("probe", max_step_up=0.16, max_step_down=0.14, max_slope=0.1, clearance=0.05)
     | named("probe", heel_length=0.1, ball_height=0.04, toe_length=0.06)
     | named("probe", held_lift=0.4, toe_clearance=0.05, lift_per_rise=0.3, lift_per_fall=0.6)
-    | named("probe", lift_over=1.2, toes_up=0.2, toes_down=0.1, toes_down_per_height=1.4)
+    | named(
+        "probe", lift_ahead=1.1, lift_over=1.2, toes_up=0.2, toes_down=0.1, toes_down_per_height=1.4
+    )
     | named("probe", toes_first=1.1, min_sole=0.9, max_slide=0.06)
     | named("probe", stance_time=0.5, swing_time=0.37)
     | named("target", foot_height=0.07, max_slope=0.08, max_ankle_height=0.25)
@@ -37,6 +39,7 @@ REACH = (
     {"contact.ground_height": 0.01}
     | named("pelvis", highest_share=0.5, extension=0.93, softness=0.04, shift=0.3)
     | named("pelvis", rise_half_life=0.04, fall_half_life=0.07, landing_time=0.2)
+    | named("pelvis", rise_speed=0.1, most_shift=0.03)
 )
 SUPPORT = (
     named("contact", ground_height=0.01, planted_height=0.071, raised_height=0.09)

@@ -61,7 +61,7 @@ LegLengthPelvis: min_length m 0.5 0 1; max_length m 0.88 0.2 1.5; speed 1/s 10 0
 LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95;
   min_extension 1 0 0 0.8
 ReachPelvis: highest_share 1 0.75 0 1.2; extension 1 0.958 0.85 1; softness m 0.025 0.002 0.1;
-  shift 1 0.15 0 1; landing_time s 0 0.02 0.3
+  shift 1 0.15 0 1; landing_time s 0 0.02 0.3; rise_speed m/s 0.3 0.05 3
 ReachPelvis SlopeTarget: rise_half_life s 0 0.002 0.5; fall_half_life s 0 0.002 0.5
 SupportPelvis: lowest_share 1 0.3 0 1; rise_half_life s 0.1 0.002 0.5;
   fall_half_life s 0.1 0.002 0.5
@@ -77,8 +77,8 @@ RootProbe: ray_up m 0.9 0 2; ray_down m 0.5 0 2
 StrideProbe: ray_up m 1 0 2; ray_down m 1 0 2; rise_start 1 0 0 0.45; rise_end 1 1 0.55 1;
   steepness 1 1.875 1 4; clearance m 0 -0.1 0.1; heel_length m 0.07 0 0.2;
   toe_length m 0.04 0 0.2; ball_height m 0.055 0 0.15; held_lift 1 0.6 0 1;
-  toe_clearance m 0.03 0 0.15; lift_per_rise 1 0.5 0 1.5; lift_per_fall 1 0.35 0 1.5;
-  lift_over 1 1.7 0 3; toes_up rad 0.1 0 0.6; toes_down rad 0.3 0 0.8;
+  toe_clearance m 0.03 0 0.15; lift_per_rise 1 0.5 0 1.5; lift_ahead 1 0.85 0 2;
+  lift_per_fall 1 0.35 0 1.5; lift_over 1 1.7 0 3; toes_up rad 0.1 0 0.6; toes_down rad 0.3 0 0.8;
   toes_down_per_height rad/m 0.9 0 3; toes_first rad/m 0.5 0 2; min_sole 1 0.65 0 1;
   max_slide m 0.1 0 0.2; stance_time s 0.65 0.2 1.5; swing_time s 0.45 0.1 1
 GroundRoot: ray_up m 10 0 20; ray_down m inf 0 20; max_speed m/s 4 0.5 10; max_step m 0.4 0.1 1
@@ -131,7 +131,7 @@ mec!: StandingContact; GroundRoot enabled=no cross_gaps=no; StrideWarp; CornerPr
 stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
-  ReachPelvis landing_time=0.12 rise_half_life=0.1 fall_half_life=0.04 spring=yes; HeelEffector;
+  ReachPelvis landing_time=0.12 rise_half_life=0.07 fall_half_life=0.04 spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
   PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 """

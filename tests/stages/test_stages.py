@@ -46,6 +46,7 @@ BENDS = {"leg.as_animated": False, "effector.max_lift": 0.0}
 EAGER = {"contact.planted_speed": 1.0, "contact.raised_speed": 1.5}
 ANIMATED = {"probe.swing_as_animated": True}
 STEP_UP = tilted((0, 0, 0), (1.0, 0, -0.25))  # rises 0.2 m ahead of the ankles
+STEP_BESIDE = tilted((0, 0.9, 0), (1.0, 0.9, -0.25))  # where the left foot is higher than both
 STEP_DOWN = tilted((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the ankles
 # Rise or fall by 0.2 m between one ray and the next on the way of a swinging foot.
 STAIRS_UP, STAIRS_DOWN = tilted((0, 0, 0), (2.0, 0, -0.8)), tilted((0, 0, 0), (-2.0, 0, 0))
@@ -165,7 +166,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         LIFTS("probe.max_slope", (0.33, 0.37), "+ target height", tilted((0.4, 0, 0))),
         LIFTS("probe.held_lift", (0.3, 0.6), "- target height", STEP_DOWN),
         LANDS("probe.toe_clearance", (0.02, 0.04), "+ target height", STEP_UP),
-        LANDS("probe.lift_per_rise", (0.3, 0.5), "+ target height", STEP_UP),
+        LANDS("probe.lift_per_rise", (0.3, 0.5), "+ target height", STEP_BESIDE),
+        LANDS("probe.lift_ahead", (0.3, 0.8), "+ target height", STEP_UP),
         LIFTS("probe.lift_per_fall", (0.3, 0.5), "+ target height", STEP_DOWN),
         LIFTS("probe.toes_up", (0.1, 0.2), "- target height", STEP_DOWN),
         LANDS("probe.toes_down", (0.1, 0.2), "+ target height", STEP_UP),
@@ -183,6 +185,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.extension", (0.92, 0.95), "+ pelvis height", TILTED),
         Case("pelvis.shift", (0.1, 0.3), "- pelvis forward", STEP_UP, clip="walks"),
         Case("pelvis.softness", (0.01, 0.05), "+ pelvis height", TILTED),
+        Case("pelvis.rise_speed", (0.05, 0.4), "+ pelvis height", STEP_UP, clip="walks"),
         Case("pelvis.landing_time", (0.1, 0.2), "- pelvis height", RAMP_DOWN, clip="walks"),
         LIFTS("effector.by_contact", (False, True), "+ miss", TILTED),
         Case("effector.extension", (0.92, 0.95), "+ pitch", STEEP),
@@ -210,7 +213,7 @@ WIDTHS = ("probe.min_support", "probe.support_radius")
 OVER = "probe.lift_over"  # in `test_stride`, as planes make no hurdle
 SOLES = ("probe.clearance", "probe.heel_length", "probe.toe_length")  # likewise
 SWITCHES = ("pelvis.enabled", "effector.by_contact", "effector.if_found")  # of `ozz`, too
-CONSTANTS = ("probe.uneven_height", "probe.highest_step")
+CONSTANTS = ("probe.uneven_height", "probe.highest_step", "pelvis.most_shift")
 OPTIONAL = ("warp.", "leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
 OPTIONAL += ("target.max_acceleration",)
 IN_OWN_TESTS = {

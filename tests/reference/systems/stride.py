@@ -20,7 +20,8 @@ FASTEST = 2.0  # m/s, of a root that climbs
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
     "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.025, shift=0.15)
-    | named("pelvis", rise_half_life=0.1, fall_half_life=0.04, spring=True, landing_time=0.12),
+    | named("pelvis", rise_half_life=0.07, fall_half_life=0.04, spring=True, landing_time=0.12)
+    | named("pelvis", rise_speed=0.3, most_shift=0.04),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
 }
@@ -36,7 +37,8 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         | named("probe", rise_start=0.0, rise_end=1.0, steepness=1.875)
         | named("probe", max_step_up=0.6, max_step_down=0.6, max_slope=1.05)
         | named("probe", heel_length=0.07, ball_height=0.055, toe_length=0.04, toe_clearance=0.03)
-        | named("probe", held_lift=0.6, lift_per_rise=0.5, lift_per_fall=0.35, lift_over=1.7)
+        | named("probe", held_lift=0.6, lift_per_rise=0.5, lift_ahead=0.85, lift_per_fall=0.35)
+        | named("probe", lift_over=1.7)
         | named("probe", toes_up=0.1, toes_down=0.3, toes_down_per_height=0.9, toes_first=0.5)
         | named("probe", min_sole=0.65, max_slide=0.1, swing_as_animated=False, use_strides=True)
         | named("probe", stance_time=0.65, swing_time=0.45)
@@ -88,7 +90,8 @@ def step(
     offset_before = state.pelvis_offset_ws if state else np.zeros(3)
     for leg, slid, stands, ball in zip(legs, probed, standing, balls, strict=True):
         below = stride_probe.below_others(slid, probed, balls)
-        hit, swing = stride_probe.ground_of_stride(slid, ball, below)
+        above = stride_probe.above_others(slid, balls)
+        hit, swing = stride_probe.ground_of_stride(slid, ball, below, above)
         foot = with_contact(leg, stands, hit, swing)
         memory = ground.smooth_height(foot, state.ground[leg.index] if state else None)
         foothold, target = ground.clamped_target(foot, memory.height.value)
@@ -124,6 +127,8 @@ def step(
     else:
         goal, ahead = support_goal(parameters, feet, requested, state), 0.0
     eased = ground.ease(parameters, "pelvis", state.pelvis if state else None, goal, frame.dt)
+    if state is not None and "pelvis.rise_speed" in parameters.values:
+        eased = pushed(parameters, eased, state, feet, footholds, terrain.up)
     if state is not None:
         rising = maths.fraction_of_half_life(parameters["pelvis.rise_half_life"], frame.dt)
         ahead = lerp(state.ahead, ahead, rising)
@@ -250,10 +255,7 @@ def end_of_swing(
         return EndOfSwing(0.0, 0.0, 0.0, np.zeros(3), 0.0)
     frame = foot.frame
     time = frame.dt * (1.0 - landing.fraction) / step
-    carried_rise = float((foothold - previous_place(frame, foot.hit, foothold)) @ foot.up)
-    root_height = float(frame.world_from_model.pos @ up)
-    speed = (root_height - state.root_height - carried_rise) / frame.dt
-    climbed = maths.clip(speed, -FASTEST, FASTEST) * time
+    climbed = root_speed(foot, foothold, up, state) * time
     lateness = (time / foot["pelvis.landing_time"]) ** 2
     return EndOfSwing(
         landing.certain * math.exp(-lateness),
@@ -261,6 +263,36 @@ def end_of_swing(
         lateness,
         landing.way - maths.across(frame.travel_ws, foot.up) * time,
         landing.rise - foot.swing_lift - climbed,
+    )
+
+
+def pushed(
+    parameters: Parameters,
+    pelvis: Motion,
+    state: State,
+    feet: list[Foot],
+    footholds: list[Array],
+    up: Array,
+) -> Motion:
+    """The body no higher over its animation than legs push it in a frame, with its root."""
+    frame = feet[0].frame
+    walking = length(maths.across(frame.travel_ws, feet[0].up))
+    speed = parameters["pelvis.rise_speed"] + stride_probe.STAIRS * walking
+    pairs = zip(feet, footholds, strict=True)
+    climbs = [root_speed(foot, foothold, up, state) for foot, foothold in pairs]
+    rise = max(speed - min(climbs), 0.0) * frame.dt
+    if pelvis.value <= state.pelvis.value + rise:
+        return pelvis
+    return Motion(state.pelvis.value + rise, rise / frame.dt)
+
+
+def root_speed(foot: Foot, foothold: Array, up: Array, state: State) -> float:
+    """How fast the root rises over the ground under a foot, m/s."""
+    frame = foot.frame
+    carried_rise = float((foothold - previous_place(frame, foot.hit, foothold)) @ foot.up)
+    root_height = float(frame.world_from_model.pos @ up)
+    return maths.clip(
+        (root_height - state.root_height - carried_rise) / frame.dt, -FASTEST, FASTEST
     )
 
 
@@ -328,6 +360,7 @@ def reach_goal(
         return free - softness * math.log(1.0 + parts)
 
     ahead = parameters["pelvis.shift"] * (limiting_ahead(moved) - limiting_ahead(animated))
+    ahead /= math.hypot(1.0, ahead / parameters["pelvis.most_shift"])
     shifted = [way - ahead * forward for way in moved]
     landed = [
         way + end.way + end.rise * foot.up
