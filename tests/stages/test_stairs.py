@@ -19,7 +19,7 @@ def beyond(chosen: Sequence[Flight]) -> list[tuple[Flight, Verdict]]:
 
 
 def test_feet_stand_on_treads_and_swing_in_one_arc_on_thirty_random_flights():
-    """Heightfields alone, which share one program; the program walks over meshes, too."""
+    """Heightfields alone, by the program of the suite; the program of stairs has meshes, too."""
     rng = np.random.default_rng(0)
     assert not beyond([sample(rng, field=True) for _ in range(30)])
 

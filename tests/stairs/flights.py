@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
@@ -12,10 +11,11 @@ from jaxik.world.terrain import Terrain
 RISERS = ("vertical", "leaning", "rounded", "open")
 STEPS, ROUNDING = 8, 4  # steps, and chords of a rounded edge
 POINTS = ROUNDING + 2  # of the profile, for each step
-BEFORE, BEYOND, HALF_WIDTH = -12.0, 14.0, 14.0  # m
+BEFORE, BEYOND, HALF_WIDTH = -3.0, 17.0, 14.0  # m
 LANDING = 1.2  # m
 OVERLAP = 0.02  # m, by which an open tread reaches under the next
 SPACING = 0.01  # m, between heights of a field
+ROWS, COLUMNS = 2001, 81  # of a field, as in the suite
 TOUCH = 0.01  # m, to either side, within which an edge may be for a point to touch it
 SLACK = 2.0 * BEYOND
 
@@ -75,7 +75,7 @@ class Flight:
         steps = np.diff(points[:, 0]) < 1e-9
         apart = points[:, 0] + 1e-7 * np.concatenate([[0], np.cumsum(steps)])
         if self.field:
-            grid = np.arange(BEFORE, BEYOND, SPACING)
+            grid = np.linspace(BEFORE, BEYOND, ROWS)
             return np.interp(z, grid, np.interp(grid, apart, points[:, 1]))
         return np.interp(z, apart, points[:, 1])
 
@@ -110,10 +110,9 @@ class Flight:
         z, y = (np.broadcast_to(ends[..., axis], (*ends.shape[:2], 2)) for axis in (0, 1))
         return np.stack([np.broadcast_to(x, z.shape), y, z], -1).reshape(-1, 3)
 
-    def field_heights(self) -> Float64[np.ndarray, "rows 2"]:
+    def field_heights(self) -> Float64[np.ndarray, "rows columns"]:
         """Of the heightfield, whose rows are `SPACING` apart."""
-        z = np.arange(BEFORE, BEYOND, SPACING)
-        return np.repeat(self.heights(z)[:, None], 2, axis=1)
+        return np.repeat(self.heights(np.linspace(BEFORE, BEYOND, ROWS))[:, None], COLUMNS, axis=1)
 
 
 def sample(rng: np.random.Generator, field: bool) -> Flight:
@@ -141,7 +140,7 @@ def mesh_of(flight: Flight) -> Terrain:
     return terrain.mesh(vertices.astype(np.float32), triangles, slack=SLACK)
 
 
-def field_of(heights: jnp.ndarray) -> Terrain:
+def field_of(heights: np.ndarray) -> Terrain:
     """A heightfield of these heights."""
-    spacing = (2.0 * HALF_WIDTH, SPACING)
+    spacing = (2.0 * HALF_WIDTH / (COLUMNS - 1), SPACING)
     return terrain.heightfield(heights, spacing, origin=(-HALF_WIDTH, 0.0, BEFORE))

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 import fitting
@@ -16,9 +15,12 @@ import jaxik
 from fitting.clips import contacts
 from fitting.clips.clip import Clip
 from fitting.ground import ground_path
+from fitting.studies.animations import Animation
+from fitting.studies.suite import NO_COVER
 from fitting.synthetic import footsteps, walker
 from fitting.synthetic.footsteps import SIDES, Foothold, Swing, stepping_foot
 from jaxik.maths import quat, vec
+from jaxik.world import terrain
 from stairs import flights
 from stairs.flights import Flight
 from support.strides import WAYS
@@ -28,7 +30,6 @@ SECONDS = 9.0
 STEP_LENGTHS = (0.25, 0.35, 0.45, 0.55, 0.65)  # m
 STEP_SECONDS, STANCE = 0.55, 0.62  # s, and part of two steps
 HIGHEST = 0.32  # m, rise of one step of a walk: two stairs
-CHUNK = 10  # flights that are walked at once
 SETTLED = 20  # frames before and after which nothing is measured
 
 
@@ -131,39 +132,36 @@ def placed(flight: Flight) -> tuple[jaxik.Frame, jaxik.Frame]:
 class Solved(NamedTuple):
     """A walk as a system leaves it, (frames legs 3), m, world space."""
 
-    ankle: Array
-    soles: Array
+    ankle: np.ndarray
+    soles: np.ndarray
     """Below ankle and ball, (frames legs 2 3)."""
 
 
-@jax.jit
-def walk_over(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Array, frames: jaxik.Frame) -> Solved:
-    """What a system makes of walks over flights, all with a leading axis."""
-
-    def walk_of(ground: Array, frames: jaxik.Frame) -> Solved:
-        mesh = ground.shape[-1] == 3
-        terrain = mesh_template().with_vertices(ground) if mesh else flights.field_of(ground)
-        result = jaxik.run(ik, rig, terrain, frames)
-        world = jaxik.Transform(
-            frames.world_from_model.pos[:, None], frames.world_from_model.rot[:, None]
-        )
-        ankle, toe = world.apply(result.pose.ankle.pos), world.apply(result.pose.toe.pos)
-        foot = quat.multiply(result.pose.ankle.rot, rig.ankle_from_foot)
-        up = quat.rotate(
-            world.rot, quat.rotate(foot, jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), ankle.shape))
-        )
-        heel = ankle - vec.scale(up, rig_heights()[0])
-        ball = toe - vec.scale(up, rig_heights()[1])
-        return Solved(ankle, jnp.stack([heel, ball], 2))
-
-    return jax.vmap(walk_of)(ground, frames)
+def solve(ik: jaxik.FootIK, flight: Flight, frames: jaxik.Frame) -> Solved:
+    """What a system makes of a walk over a flight; those over fields share the suite's program."""
+    clip = choose(flight).clip
+    if flight.field:
+        ground = terrain.combine(flights.field_of(flight.field_heights()), NO_COVER.terrain())
+    else:
+        ground = mesh_template().with_vertices(flight.vertices())
+    result = Animation(clip, ground, given_frames=frames).run(ik)
+    world = jaxik.Transform(
+        frames.world_from_model.pos[:, None], frames.world_from_model.rot[:, None]
+    )
+    ankle, toe = world.apply(result.pose.ankle.pos), world.apply(result.pose.toe.pos)
+    foot = quat.multiply(result.pose.ankle.rot, clip.rig.ankle_from_foot)
+    up = quat.rotate(
+        world.rot, quat.rotate(foot, jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), ankle.shape))
+    )
+    heel = ankle - vec.scale(up, rig_heights()[0])
+    ball = toe - vec.scale(up, rig_heights()[1])
+    return Solved(np.asarray(ankle), np.stack([heel, ball], 2))
 
 
 @functools.cache
-def mesh_template() -> jaxik.world.terrain.Terrain:
+def mesh_template() -> terrain.Terrain:
     """The mesh whose vertices those of all flights replace."""
-    with jax.ensure_compile_time_eval():
-        return flights.mesh_of(flights.sample(np.random.default_rng(0), field=False))
+    return flights.mesh_of(flights.sample(np.random.default_rng(0), field=False))
 
 
 def rig_heights() -> tuple[float, float]:
@@ -175,18 +173,18 @@ def judge(flight: Flight, level: jaxik.Frame, solved: Solved) -> Verdict:
     """What is wrong with a walk over a flight; see `Verdict`."""
     part = slice(SETTLED, FRAMES - SETTLED)
     standing = np.asarray(level.stride.standing) > 0
-    above, sunk = flight.clearances(np.asarray(solved.soles))
+    above, sunk = flight.clearances(solved.soles)
     above, sunk = above.min(-1), sunk.max(-1)
     off = np.maximum(above, sunk)[part][standing[part]].max(initial=0.0)
 
     animated = np.asarray(
         jax.vmap(jaxik.Transform.apply)(level.world_from_model, level.pose.ankle.pos)
     )
-    correction = np.asarray(solved.ankle) - animated
+    correction = solved.ankle - animated
     change = np.linalg.norm(np.diff(correction, axis=0, prepend=correction[:1]), axis=-1)
     pop = dip = bend = 0.0
     for leg in range(standing.shape[1]):
-        heights = np.asarray(solved.ankle)[:, leg, 1]
+        heights = solved.ankle[:, leg, 1]
         runs = contacts.runs(standing[:, leg])
         for first, last in runs:
             at = slice(max(first + 1, SETTLED), min(last + 1, FRAMES - SETTLED))
@@ -212,24 +210,10 @@ def walked(
 ) -> list[tuple[Flight, Verdict]]:
     """Flights with the verdict on a walk over each, with or without known footholds."""
     verdicts = []
-    for field in (False, True):
-        kind = [flight for flight in chosen if flight.field is field]
-        for start in range(0, len(kind), CHUNK):
-            part = kind[start : start + CHUNK]
-            full = [part[i % len(part)] for i in range(CHUNK)]
-            over = [placed(flight) for flight in full]
-            ground = [x.field_heights() if field else x.vertices() for x in full]
-            frames = jax.tree.map(
-                lambda *x: jnp.asarray(np.stack(x), jnp.float32), *(frames for frames, _ in over)
-            )
-            if not known:
-                stride = frames.stride
-                stride = dataclasses.replace(stride, known=jnp.zeros_like(stride.known))
-                frames = dataclasses.replace(frames, stride=stride)
-            rig = choose(full[0]).clip.rig
-            ground = jnp.asarray(np.stack(ground), jnp.float32)
-            solved = jax.tree.map(np.asarray, walk_over(ik, rig, ground, frames))
-            for i, (flight, (_, level)) in enumerate(zip(part, over, strict=False)):
-                alone = jax.tree.map(lambda x, i=i: x[i], solved)
-                verdicts.append((flight, judge(flight, level, alone)))
+    for flight in chosen:
+        frames, level = placed(flight)
+        if not known:
+            stride = dataclasses.replace(frames.stride, known=0.0 * frames.stride.known)
+            frames = dataclasses.replace(frames, stride=stride)
+        verdicts.append((flight, judge(flight, level, solve(ik, flight, frames))))
     return verdicts

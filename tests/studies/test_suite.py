@@ -20,7 +20,7 @@ from fitting.studies.suite import Suite, run_situations
 from fitting.synthetic import footsteps
 from jaxik.maths import parameter_tree
 
-BRIEF = 1.5  # s
+BRIEF = 2.5  # s; the bound of pops is that of the fastest whole swing, and few are whole in less
 FEW = ("flat walk", "stairs up")
 
 
@@ -30,8 +30,8 @@ def plan(*names: str) -> suite.Plan:
 
 @pytest.fixture(scope="module")
 def still():
-    """The record's system, without any effect."""
-    return parameter_tree.replace(preset_system("record"), {"leg.weight": 0.0, "pelvis.limit": 0.0})
+    """`stride`, whose program the defaults need, too, without any effect on feet."""
+    return parameter_tree.replace(preset_system("stride"), {"leg.weight": 0.0})
 
 
 @pytest.fixture(scope="module")
@@ -203,8 +203,7 @@ def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
 @pytest.mark.parametrize(
     ("chosen", "names"),
     [
-        # Longer: the bound of pops is that of the fastest whole swing, and few are whole in 1.5 s.
-        (plan(*FEW)._replace(seconds=2.5), ["stride"]),
+        (plan(*FEW), ["stride"]),
         pytest.param(suite.choose(), preset_names(), marks=pytest.mark.slow),
     ],
     ids=["for a while", "at length"],
