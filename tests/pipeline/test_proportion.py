@@ -80,11 +80,8 @@ def result(request) -> jaxik.Result:
         for other, share in OTHERS
         for w in steps
     ]
-    run = jax.jit(
-        jax.vmap(lambda frames: jaxik.run(ik, rig, to_terrain(BROKEN), frames)),
-        compiler_options=QUICK,
-    )
-    return run(stacked([*rows, *map(jittered, rows), *faint]))
+    run = jax.jit(jax.vmap(jaxik.run, (None, None, None, 0)), compiler_options=QUICK)
+    return run(ik, rig, to_terrain(BROKEN), stacked([*rows, *map(jittered, rows), *faint]))
 
 
 def test_a_jitter_of_all_that_goes_in_moves_nothing_by_more_than_its_share(result):

@@ -16,6 +16,7 @@ import pytest
 import jaxik
 from jaxik import HARD
 from jaxik.maths import parameter_tree
+from jaxik.maths.parameter_tree import with_option
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.probe import foot_heading
 from jaxik.stages.probe.limits import AbstractLimitedProbe
@@ -35,7 +36,7 @@ PROBES = {
     "FootProbe": jaxik.presets.ozz,
     "RootProbe": jaxik.presets.unreal,
     "CornerProbe": jaxik.presets.mec,
-    "StrideProbe": jaxik.presets.stride,
+    "StrideProbe": lambda: with_option(jaxik.presets.stride(), "probe.slide_to_support", False),
 }
 REST = [pytest.param(name, marks=pytest.mark.slow) for name in list(PROBES)[1:]]
 FRAME = animate(RIG, count=1)[0]
@@ -49,7 +50,7 @@ def system(preset: str, check_support: bool = False, **values: Any) -> jaxik.Foo
     """The preset with these limits; it refuses narrow ground too if it checks for support."""
     named = {f"probe.{name}": value for name, value in (LIMITS | values).items()}
     ik = parameter_tree.replace(PROBES[preset](), named)
-    return parameter_tree.with_option(ik, "probe.check_support", check_support)
+    return with_option(ik, "probe.check_support", check_support)
 
 
 def inputs_of(ground: Any) -> Inputs:
@@ -162,7 +163,7 @@ def test_a_ray_from_no_higher_than_a_step_looks_no_further_than_its_first_ground
 
 def test_infinite_limits_refuse_nothing():
     wide = system("FootProbe", False, **dict.fromkeys(LIMITS, np.inf))
-    never = parameter_tree.with_option(wide, "probe.limited", False)
+    never = with_option(wide, "probe.limited", False)
     ours, theirs = (read(ik, bumps(), starts_over_bumps(seed=1)) for ik in (wide, never))
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
@@ -196,7 +197,7 @@ def test_feet_stand_over_gaps_narrower_than_half_a_sole_and_step_into_wider_ones
             place = starts[:, leg, [2, 0][leg]]
             gap = (np.abs(place) < width / 2) & (width > 0.1)
             np.testing.assert_allclose(heights[width], np.where(gap, -0.2, 0.0), atol=1e-12)
-    unlimited = parameter_tree.with_option(ik, "probe.limited", False)
+    unlimited = with_option(ik, "probe.limited", False)
     slope = PlainTerrain(maths.Y, triangles=np.array(sloped(0.5) * BLOCKS))
     for system_on, ground in ((ik, slope), (unlimited, bumps())):
         places = system_on, to_terrain(ground), jnp.asarray(starts_over_bumps(seed=4))
