@@ -18,7 +18,10 @@ from support.cases import QUICK
 from support.clips import to_frames, to_rig
 
 FRAMES, HZ = 120, 60.0
-GAMES = (pytest.param("ozz", marks=pytest.mark.slow), "unreal", "mec")  # with roots of their own
+OZZ, RECORD, STRIDE = (
+    pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "record", "stride")
+)
+GAMES = (OZZ, "unreal", "mec")  # with roots of their own
 TOES = standing()[0, 2] + 0.12  # m, ahead of the root
 APART = 20.0  # m, from the middle of one place to that of the next
 
@@ -110,7 +113,7 @@ def test_unreal_takes_a_captured_idle_for_standing():
     np.testing.assert_allclose(sorted(raised), [0.0, 0.12], atol=0.01)
 
 
-@pytest.mark.parametrize("preset", ["record", "mec"])
+@pytest.mark.parametrize("preset", [RECORD, "mec"])
 def test_a_foot_whose_toes_are_over_a_ledge_stays_level(preset: str):
     frames = standing_clip("ledge")
     result = run(preset, frames)
@@ -127,7 +130,7 @@ def test_four_legs_lie_along_a_slope_and_two_do_not(preset: str):
         assert (rate == along) if along else rate < 0
 
 
-@pytest.mark.parametrize("preset", ["record", pytest.param("stride", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("preset", [RECORD, STRIDE, "mec"])
 def test_a_squatter_with_a_foot_on_a_block_puts_it_on_top(preset: str):
     """The legs fold hardly more than animated, so the body rises with the block."""
     squat = standing_clip(
