@@ -33,7 +33,7 @@ def mapped_by_jax(monkeypatch):
 
 
 def test_the_pipeline_has_rules_for_its_primitives_in_the_installed_jax(mapped_by_jax):
-    problem = workloads.problem(12, workloads.parameter_names(20))
+    problem = workloads.problem(16, workloads.parameter_names(20))
     jax.make_jaxpr(problem.residuals_and_jacobian)(problem.space.start)
     jax.make_jaxpr(lanes(problem.log_probability))(jnp.stack([problem.space.start] * 2))
     assert mapped_by_jax <= MAPPED_BY_JAX, f"JAX {jax.__version__} changed {mapped_by_jax}"

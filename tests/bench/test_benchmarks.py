@@ -437,7 +437,7 @@ def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
     (clip,), (system,) = session.clips, session.starts.values()
     assert clip.animation.clip.fps == benchmarks.RATE and clip.animation.clip.frame_count == 6
     assert system.leg is not None and session.cost is not None
-    problem = workloads.problem(12)
+    problem = workloads.problem(16)
     assert problem.space.size == 20 and all(problem.space.smooth)
     count = max(workloads.FULL.parameters)
     names = workloads.parameter_names(count)
