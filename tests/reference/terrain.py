@@ -73,13 +73,13 @@ class Terrain:
         if self.platform < 0:
             return self
         pose = platforms[self.platform]
-        corners = [apply(pose, corner) for corner in self.triangles.reshape(-1, 3)]
+        axes = np.array([rotate(pose.rot, axis) for axis in np.eye(3)])
         return replace(
             self,
             planes=[
                 (apply(pose, point), rotate(pose.rot, normal)) for point, normal in self.planes
             ],
-            triangles=np.reshape(corners, (-1, 3, 3)),
+            triangles=pose.pos + self.triangles @ axes,
         )
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:

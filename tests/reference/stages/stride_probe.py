@@ -382,13 +382,15 @@ def easiest(
     """
     pairs = zip(heights, (0.0, *PATH, 1.0), strict=True)
     start, *middle, end = [at - slope * place for at, place in pairs if at is not None]
+    steps = itertools.combinations([start, *middle, end], 2)
+    eases = {(before, after): ease(leg, float(after - before)) for before, after in steps}
     choices = (
         chosen
         for count in range(len(middle) + 1)
         for chosen in itertools.combinations(middle, count)
     )
     return max(
-        min(ease(leg, float(step)) for step in np.diff([start, *chosen, end])) for chosen in choices
+        min(eases[step] for step in itertools.pairwise([start, *chosen, end])) for chosen in choices
     )
 
 
