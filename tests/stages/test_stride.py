@@ -1,71 +1,31 @@
-"""The preset `stride`: nothing moves on a flat floor, and the ground never jumps.
+"""The preset `stride`: the ground under its feet never jumps.
 
-Also soles with too little ground, which slide along themselves to where more of them has some;
-feet that swing over uneven ground, later, higher, and with the toes pointed down; and heels.
+Also soles with too little ground, which slide along themselves to where more of them has some; and
+feet that swing over uneven ground, later, higher, and with the toes pointed down.
 """
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import brentq, minimize_scalar
 
 import jaxik
 from jaxik.maths import quat
 from jaxik.stages import effector
 from jaxik.stages.probe.swing import bump
 from jaxik.world.frame import GroundHits
-from reference import characters, maths, sample_poses
+from reference import characters, maths
 from reference.stages import stride_probe as reference
 from reference.terrain import Terrain as PlainTerrain
-from support import stride_runs
 from support.cases import RIG
 from support.clips import animate, assert_close, at, to_frames, to_ik, to_terrain
 from support.gradients import finite_jacobian
 from support.probing import BLOCKS, ground_under, level_blocks, quad
-from support.stride_runs import FLAT, of_legs, on_platform, solved
-from support.strides import WAYS, blocks, walk
-
-FLOORS, HZ = of_legs(FLAT), 25.0
-
-
-def four_seconds(start: float = -2.0, **changes: Any) -> list[characters.Frame]:
-    """A walk, m forward from the start, on a platform that stays where it is."""
-    still = {name: [sample_poses.STILL] for name in ("platforms", "platforms_before")}
-    frames = walk(RIG, stride_runs.FRAMES, hz=HZ, start=start * maths.Z, **still, **changes)
-    none = dict.fromkeys(WAYS, np.zeros((2, 3)))
-    for frame in frames:
-        assert frame.stride is not None
-        frame.stride = dataclasses.replace(frame.stride, **none)
-    return frames
-
-
-# Flat floor.
-
-
-@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
-def test_nothing_changes_on_a_flat_floor(known: bool):
-    plain = four_seconds(known=known, heading=0.1)
-    frames = to_frames(plain)
-    legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
-    assert legs.max() > 0.99 * (sample_poses.THIGH + sample_poses.SHIN), "knees are straight"
-    result = solved({"lock.enabled": True}, RIG, FLOORS, plain)
-    assert 0.3 < np.asarray(result.trace.advanced.state.lock.locked).mean() < 0.9
-    sensed, effector = result.trace.sensed, result.trace.advanced.effector
-    assert_close(effector.target_ws, sensed.ankle_ws, 1e-9)
-    assert_close(effector.rot_ws, sensed.ankle_rot_ws, 1e-9)
-    assert np.abs(result.body.pos).max() < 1e-9
-    for joint in ("hip", "knee", "ankle", "toe"):
-        actual, expected = (getattr(pose, joint) for pose in (result.pose, frames.pose))
-        assert_close(actual.pos, expected.pos, 1e-9)
-        rots = np.asarray(actual.rot), np.asarray(expected.rot)
-        assert sample_poses.rotation_angle(*rots) < 1e-7, joint
-
+from support.strides import WAYS, walk
 
 # The ground under a swinging foot.
 
@@ -161,30 +121,6 @@ def test_stairs_are_climbed_that_are_as_high_as_a_ledge_that_is_refused():
     assert np.abs(np.diff(climbed)).max() < 0.01
     ledge = level_blocks((-3.0, 0.9, 0.0), (0.9, 3.0, 0.75))
     assert np.abs(heights(ledge, frames)[: len(FINE) // 2]).max() < 0.2
-
-
-# Feet that stand.
-
-
-def test_a_locked_ball_does_not_slide_while_the_heel_rises():
-    """On a walk whose standing feet slip sideways."""
-    plain, slips = four_seconds(), []
-    for index, frame in enumerate(plain):
-        pos = frame.world_from_model.pos + 0.08 * index / HZ * maths.X
-        root = frame.world_from_model._replace(pos=pos)
-        plain[index] = dataclasses.replace(frame, world_from_model=root)
-    plain = sample_poses.with_speeds(plain)
-    frames = to_frames(plain)
-    for hold_ball in (True, False):
-        values = {"lock.enabled": True, "lock.hold_ball": hold_ball, "lock.lock_half_life": 0.0}
-        result = solved(values, RIG, FLOORS, plain)
-        ball = jax.vmap(jaxik.Transform.apply)(frames.world_from_model, result.pose.toe.pos)
-        locked = np.asarray(result.trace.advanced.state.lock.locked) > 0
-        locked_twice = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
-        assert locked_twice.mean() > 0.3
-        slip = np.linalg.norm(np.diff(ball, axis=0)[..., [0, 2]], axis=-1)
-        slips.append(slip[locked_twice].max())
-    assert slips[0] < 1e-9 and slips[1] > 1e-3, "a locked ankle lets the ball slide"
 
 
 # Soles with too little ground.
@@ -411,48 +347,7 @@ def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
     assert np.abs(round_it).max() < 0.01
 
 
-# Heels that rise about the ball, compared with a numerical search and along a walk.
-
-RISES, STAYS = 0.0, 0.3  # sine of a leg's angle ahead of its hip
-VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.1, "probe.swing_as_animated": True}
-
-
-def search_angle(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: float) -> float:
-    """The smallest angle, rad, that brings the ankle within `length`, m, or as near as possible.
-
-    It is 0 for a leg that is short enough, or that a small rise of the heel would lengthen.
-    """
-
-    def distance(angle: float) -> float:
-        return maths.length(to_ball + maths.rotate(maths.from_axis_angle(axis, -angle), arm))
-
-    if distance(0.0) <= length or distance(1e-5) > distance(0.0):
-        return 0.0
-    best: Any = minimize_scalar(
-        distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9}
-    )
-    if distance(best.x) >= length:
-        return float(best.x)
-    root = brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)
-    return root  # pyright: ignore[reportReturnType]  # a float without `full_output`
-
-
-def test_the_angle_of_the_heel_is_the_one_that_a_search_finds():
-    """Of random balls, ankles behind and above them, and expected lengths, some too short."""
-    rng = np.random.default_rng(2)
-    legs = []
-    for _ in range(60):
-        axis = maths.unit(np.array([-1.0, *rng.normal(0.0, 0.3, 2)]), maths.X)
-        to_ball = np.array([rng.normal(0.0, 0.1), -0.9, rng.uniform(-0.6, 0.6)])
-        arm = np.array([rng.normal(0.0, 0.02), rng.uniform(0.0, 0.1), rng.uniform(-0.18, -0.1)])
-        excess = rng.choice([-0.02, 0.01, 0.05, 0.3])
-        legs.append((to_ball, arm, axis, maths.length(to_ball + arm) - excess))
-    expected = np.array([search_angle(*each) for each in legs])
-    columns = map(np.stack, zip(*legs, strict=True))
-    actual = jax.jit(effector.heel_angle)(*columns)
-    assert 0.2 < (expected > 0).mean() < 0.9
-    # Where the length cannot be reached, the search is only as precise as a minimum.
-    np.testing.assert_allclose(np.maximum(actual, 0.0), expected, rtol=0, atol=1e-6)
+# Heels that rise about the ball.
 
 
 def test_the_angle_has_finite_gradients_where_there_is_no_solution():
@@ -466,79 +361,3 @@ def test_the_angle_has_finite_gradients_where_there_is_no_solution():
     )
     axis = np.tile(-maths.X, (len(length), 1))
     finite_jacobian(effector.heel_angle, np.array(to_ball), np.array(arm), axis, np.array(length))
-
-
-@functools.cache
-def over_blocks() -> SimpleNamespace:
-    """Heels on a walk across uneven blocks; (frames, legs), but for the clip and its result."""
-    plain = four_seconds(start=-2.5, heading=0.1)
-    ground = blocks(np.random.default_rng(5), max_height=0.2, irregular=False)
-    result = solved(VALUES, RIG, of_legs(on_platform(ground.triangles)), plain)
-    frames = to_frames(plain)
-    sensed, advanced = result.trace.sensed, result.trace.advanced
-    hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
-    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws
-    before = advanced.foothold_ws + advanced.hold.offset_ws + lift - hip
-    animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
-    extension = VALUES["effector.extension"] * (sample_poses.THIGH + sample_poses.SHIN)
-    longest = np.maximum(extension, animated)
-
-    normal = sensed.ground.ankle.normal
-    up = jnp.broadcast_to(jnp.asarray(maths.Y), normal.shape)
-    tilt = quat.shortest_arc(up, normal, sensed.ahead_ws)
-    arm = quat.rotate(tilt, sensed.ankle_ws - sensed.ball_ws)
-    level_axis = -quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X))
-    axis = quat.rotate(tilt, jnp.broadcast_to(level_axis[:, None], arm.shape))
-    columns = [np.reshape(x, (-1, 3)) for x in (before - arm, arm, axis)]
-    searched = [search_angle(*leg) for leg in zip(*columns, longest.ravel(), strict=True)]
-    cosine = np.abs(np.sum(advanced.effector.rot_ws * sensed.ankle_rot_ws, axis=-1))
-    length = np.linalg.norm(before, axis=-1)
-    return SimpleNamespace(
-        frames=frames,
-        result=result,
-        lift=2.0 * np.arccos(np.minimum(cosine, 1.0)),  # rad
-        searched=np.reshape(searched, longest.shape),  # rad
-        ahead=np.sum(before * sensed.ahead_ws, -1) / length,  # sine of the leg's angle
-        before=length,  # m, of the leg, with its heel down
-        after=np.linalg.norm(advanced.effector.target_ws - hip, axis=-1),
-        longest=longest,
-        to_ball_ws=np.asarray(-arm),  # m, from the ankle, of a level sole laid on the ground
-    )
-
-
-def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
-    """But less, the further its leg points ahead."""
-    walk, max_lift = over_blocks(), VALUES["effector.max_lift"]
-    trailing = walk.searched[walk.ahead <= RISES]
-    assert 0.02 < (trailing > 0.0).mean() < 0.9 and (trailing > max_lift).any()
-    too_long = np.minimum(walk.searched, max_lift)
-    share = [1.0 - maths.smooth01((x - RISES) / (STAYS - RISES)) for x in walk.ahead.ravel()]
-    expected = too_long * np.reshape(share, too_long.shape)
-    assert (too_long - expected).max() > 0.02
-    np.testing.assert_allclose(walk.lift, expected, rtol=0, atol=1e-6)
-
-
-def test_a_rising_heel_keeps_the_leg_at_its_longest_and_stays_down_where_it_is_shorter():
-    walk, max_lift = over_blocks(), VALUES["effector.max_lift"]
-    rises = (walk.lift > 1e-6) & (walk.searched < max_lift) & (walk.ahead <= RISES)
-    assert rises.mean() > 0.02
-    np.testing.assert_allclose(walk.after[rises], walk.longest[rises], rtol=0, atol=1e-9)
-    short = walk.before < walk.longest - 1e-9
-    assert short.mean() > 0.1
-    assert walk.lift[short].max() < 1e-7
-    np.testing.assert_allclose(walk.after[short], walk.before[short], rtol=0, atol=1e-12)
-
-
-def test_the_ball_stays_in_place_while_the_heel_rises():
-    walk = over_blocks()
-    sensed, advanced = walk.result.trace.sensed, walk.result.trace.advanced
-    world = walk.frames.world_from_model
-    ball = jax.vmap(jaxik.Transform.apply)(world, walk.result.pose.toe.pos)
-    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws
-    moved = np.asarray(ball - (advanced.foothold_ws + lift + walk.to_ball_ws))
-    arrived = (np.asarray(walk.result.reached) > 0) & (np.asarray(walk.result.aimed) > 0)
-    assert (walk.lift[arrived] > 0.02).any()
-    along = np.sum(moved * sensed.ground.ankle.normal, axis=-1)
-    assert np.abs(along)[arrived].max() < 1e-8
-    # Pitch and roll turn the foot a little about the normal, and so the ball along the ground.
-    assert np.abs(moved)[arrived].max() < 0.002

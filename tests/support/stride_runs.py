@@ -1,6 +1,7 @@
 """The preset `stride` with a terrain for each leg: one program for all clips of `FRAMES` frames."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,7 +32,12 @@ def on_platform(triangles: Any) -> PlainTerrain:
 
 
 UNEVEN = on_platform(blocks(np.random.default_rng(3)).triangles)
-FLAT = on_platform(quad((-9.0, 0.0, -9.0), (-9.0, 0.0, 9.0), (9.0, 0.0, 9.0), (9.0, 0.0, -9.0)))
+EDGES = np.linspace(-9.0, 9.0, TRIANGLES // 2 + 1)  # of strips, so that both have a grid alike
+STRIPS = [
+    quad((-9.0, 0.0, back), (-9.0, 0.0, front), (9.0, 0.0, front), (9.0, 0.0, back))
+    for back, front in itertools.pairwise(EDGES)
+]
+FLAT = on_platform(np.concatenate(STRIPS))
 
 
 def of_legs(ground: PlainTerrain, *tilts: np.ndarray) -> LegTerrains:
