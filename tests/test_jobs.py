@@ -82,7 +82,7 @@ SAMPLE_WORK = [
     ("Sampling up to 20 steps of 8 walkers", (posterior, "_check")),
     ("Placing 8 walkers",),
     ("Summing up the chain", (posterior, "_posterior")),
-    ("Playing 80 draws of the posterior", (replay._Clip, "add"), PLAY),
+    ("Playing 20 draws of the posterior", (replay._Clip, "add"), PLAY),
     ("Writing the posterior",),
     (
         "Drawing the posterior",
@@ -150,6 +150,7 @@ class Done(NamedTuple):
 def quick_jobs() -> Iterator[None]:
     """Jobs fit residuals that compile at once, and draw nothing; they play the real pipeline."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay, "DRAWS", 20)
         patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
         patch.setattr(Figure, "savefig", lambda figure, path, **look: Path(path).touch())
         yield
@@ -291,9 +292,10 @@ import json, sys
 import jax.numpy as jnp
 import fitting
 from fitting.experiment import problems
+from fitting.studies.sample import replay
 from support import quick
 
-problems.residuals_of_scenes = quick.residuals_of_scenes
+problems.residuals_of_scenes, replay.DRAWS = quick.residuals_of_scenes, 20
 fitted = fitting.fit(sys.argv[1])
 posterior = fitting.sample(fitted)
 new = str(jnp.ones(1).dtype)
