@@ -72,6 +72,12 @@ class Slot:
     index: int
 
 
+class _Plain(eqx.Module):
+    """An output without its arrays, as it leaves a program."""
+
+    tree: PyTree = eqx.field(static=True)
+
+
 class Program(NamedTuple):
     """A traced program."""
 
@@ -233,18 +239,28 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
             return output
         return program.call(jax.tree.leaves(eqx.filter(arguments, eqx.is_array)))
 
+    def of_leaves(structure: Any, static: tuple[Any, ...], arrays: list[jax.Array]) -> Any:
+        rest = iter(arrays)
+        leaves = [next(rest) if leaf is None else leaf for leaf in static]
+        whole: Callable[..., Any] = from_cache
+        args, named = jax.tree.unflatten(structure, leaves)
+        traced, plain = eqx.partition(whole(*args, **named), eqx.is_array)
+        return traced, _Plain(plain)
+
+    of_leaves.__name__ = function.__name__
     inside = eqx.filter_jit(function)
-    outside = eqx.filter_jit(functools.wraps(function)(from_cache))
+    outside = jax.jit(of_leaves, static_argnums=(0, 1))  # much leaner than `filter_jit`
 
     @functools.wraps(function)
     def call(*args: Inputs.args, **named: Inputs.kwargs) -> Output:
         leaves, structure = jax.tree.flatten((args, named))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return inside(*args, **named)
-        if (fixed := _committed(leaves)) is not leaves:
-            args, named = jax.tree.unflatten(structure, fixed)
+        static = tuple(None if isinstance(leaf, jax.Array) else leaf for leaf in leaves)
+        arrays = [leaf for leaf in _committed(leaves) if isinstance(leaf, jax.Array)]
         try:
-            return outside(*args, **named)
+            traced, plain = outside(structure, static, arrays)
+            return eqx.combine(traced, plain.tree)
         finally:
             if (work := activity.innermost()) is not None:
                 work.ended_compiling(name)
@@ -270,8 +286,9 @@ def _committed(leaves: list[Any]) -> list[Any]:
     loose = [i for i, leaf in enumerate(leaves) if not getattr(leaf, "committed", True)]
     if not loose:
         return leaves
-    shardings = {leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array)}
-    if len(set().union(*(sharding.device_set for sharding in shardings))) > 1:
+    shardings = [leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array)]
+    distinct = {id(sharding): sharding for sharding in shardings}.values()  # hashing takes long
+    if len(set().union(*(sharding.device_set for sharding in distinct))) > 1:
         return leaves
     fixed, device = list(leaves), leaves[loose[0]].sharding
     for i, leaf in zip(loose, jax.device_put([leaves[i] for i in loose], device), strict=True):
