@@ -259,7 +259,7 @@ def test_the_folder_of_another_calibration_or_an_unknown_one_is_refused(
     for top, rest, words in (
         ("seed = 1", SAMPLE, "differs from .* in: seed; name another folder"),
         ("fps = 20.0", SAMPLE, "in: problem; name"),
-        ("", SAMPLE.replace("240", "250"), "in: sample; name"),
+        ("", SAMPLE.replace("120", "130"), "in: sample; name"),
         ("", SAMPLE + "[fit]\nstarts = 3\n", "in: fit; name"),
         ("", SAMPLE + "[start]\npelvis.on_gain = 0.5\n", "in: start; name"),
     ):

@@ -25,7 +25,7 @@ SIX_SECONDS = CLIP + "end = 6.0\n"
 FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
 GIVEN = '[noise]\ncorrelation = "given"\n'  # what the residuals of a pipeline say is not asked
 SQUARES = 'loss = "squares"\n'
-SAMPLE = "[sample]\nwalkers = 8\nstop_at = 15.0\nmax_steps = 240\n"
+SAMPLE = "[sample]\nwalkers = 8\nstop_at = 15.0\nmax_steps = 120\n"
 WITHOUT = """
 [[without]]
 name = "pitch"
