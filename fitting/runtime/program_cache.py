@@ -256,6 +256,7 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
         leaves, structure = jax.tree.flatten((args, named))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return inside(*args, **named)
+        leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         static = tuple(None if isinstance(leaf, jax.Array) else leaf for leaf in leaves)
         arrays = [leaf for leaf in _committed(leaves) if isinstance(leaf, jax.Array)]
         try:
