@@ -61,7 +61,7 @@ def run(frames: jaxik.Frame, ground: Terrain = STEP) -> jaxik.Result:
 
 def foreseen(
     ik: jaxik.FootIK, frames: jaxik.Frame, memory: Foresight = NOTHING, started: bool = False
-) -> tuple[Foresight, Stride]:
+) -> tuple[Foresight, Any]:
     """What the probe remembers, and the strides by which it goes, in each frame."""
     return resumed(ik, frames, memory, started)
 

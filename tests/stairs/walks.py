@@ -143,7 +143,7 @@ def solve(ik: jaxik.FootIK, flight: Flight, frames: jaxik.Frame) -> Solved:
     if flight.field:
         ground = terrain.combine(flights.field_of(flight.field_heights()), NO_COVER.terrain())
     else:
-        ground = mesh_template().with_vertices(flight.vertices())
+        ground = mesh_template().with_vertices(jnp.asarray(flight.vertices()))
     result = Animation(clip, ground, given_frames=frames).run(ik)
     world = jaxik.Transform(
         frames.world_from_model.pos[:, None], frames.world_from_model.rot[:, None]
