@@ -378,7 +378,7 @@ def padded(tree: Tree) -> Tree:
         more = -len(x) % LENGTH
         if not more:
             return x
-        x = np.asarray(x)
-        return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
+        rows = np.asarray(x)
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)]))
 
     return jax.tree.map(pad, tree)

@@ -223,7 +223,7 @@ def build(
         first=_as_jax(padded(lists.first, lists.first[-1], CELLS * len(plan)), np.int32),
         children=_as_jax(padded(lists.children, -1, CELLS * len(plan)), np.int32),
         members=_as_jax(padded(lists.members, 0, ENTRIES * len(plan)), np.int32),
-        shape=_as_jax(lists.shape, np.int32),
+        shape=_as_jax(np.array(lists.shape), np.int32),
         depth=lists.depth,
     )
 

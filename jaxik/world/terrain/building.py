@@ -215,7 +215,8 @@ def merge(
             triangles.append(members + count)
             layers.append(bits)
             count += len(corners)
-    return Terrain(up_ws, (Mesh.build(*map(np.concatenate, (vertices, triangles, layers)), up_ws),))
+    corners, members, bits = map(np.concatenate, (vertices, triangles, layers))
+    return Terrain(up_ws, (Mesh.build(corners, members, bits, up_ws),))
 
 
 def moving(terrain: Terrain, platform: int, tilts: bool = False) -> Terrain:
