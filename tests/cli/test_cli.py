@@ -285,8 +285,8 @@ def test_run_writes_the_motion_on_the_skeleton_that_came_in(tmp_path, capsys):
 def on_hill(tmp_path_factory) -> list:
     """Runs a flat walk on a hill of 2 m."""
     folder = tmp_path_factory.mktemp("hill")
-    save_clip(folder / "walk.npz", walker.walk(6.0, 30.0))
-    save_mesh(folder / "hill.ply", *grounds.hill())
+    save_clip(folder / "walk.npz", walker.walk(5.0, 25.0))
+    save_mesh(folder / "hill.ply", *grounds.hill(rows=61))  # of less than 512 triangles
     return ["run", folder / "walk.npz", "--terrain", folder / "hill.ply", "-o"]
 
 
@@ -307,7 +307,7 @@ def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_p
 def test_apply_says_how_far_it_puts_a_clip_that_follows_its_ground_from_the_captured_one(
     on_hill, tmp_path, capsys
 ):
-    walk, out = walker.walk(6.0, 30.0), tmp_path / "out.npz"
+    walk, out = walker.walk(5.0, 25.0), tmp_path / "out.npz"
     along = np.clip((walk.positions_ws[:, 0, 2] - 1.0) / 14.0, 0.0, 1.0)  # the hill
     captured = raised(walk, 1.0 - np.cos(2.0 * np.pi * along))
     save_clip(tmp_path / "up.npz", captured)
@@ -343,7 +343,7 @@ def test_run_names_the_other_up_axis(on_hill, tmp_path, capsys, monkeypatch):
     """By clip and ground alone: the ground's shapes would need a program of their own."""
     result = Mock(corrections=Mock(twist=None, spine=None))
     monkeypatch.setattr(Animation, "solve", lambda animation, ik: (result, animation.clip))
-    monkeypatch.setattr(Animation, "reached", lambda *_: np.full((180, 2), np.nan))
+    monkeypatch.setattr(Animation, "reached", lambda *_: np.full((125, 2), np.nan))
     warnings.filterwarnings("always", category=GroundWarning)  # the module's mark comes first
     run(*on_hill, tmp_path / "out.npz", "--file-up", "z")
     output = capsys.readouterr()

@@ -15,9 +15,9 @@ def terrain_of(mesh: Mesh) -> Terrain:
     return terrain.mesh(mesh.vertices, mesh.faces)
 
 
-def hill(height: float = 2.0, length: float = 14.0) -> Mesh:
+def hill(height: float = 2.0, length: float = 14.0, rows: int = 321) -> Mesh:
     """Flat for 1 m of z, a hill of one cosine wave, and flat again."""
-    z = np.linspace(-2.0, 30.0, 321)
+    z = np.linspace(-2.0, 30.0, rows)
     inside = np.clip((z - 1.0) / length, 0.0, 1.0)
     heights = 0.5 * height * (1.0 - np.cos(2.0 * np.pi * inside))
     return strip([Point(*point) for point in zip(z, heights, strict=True)])
