@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.experiment import experiment_files, problems
 from fitting.experiment.problems import load_known_values
+from fitting.motion import playback
 from fitting.problem import residuals
 from fitting.problem.problem import Problem, digest
 from fitting.problem.scene import PER_LEG
@@ -52,15 +53,13 @@ class Evaluated(NamedTuple):
 
 @jax.jit
 def evaluation(problem: Problem, u: jax.Array):
-    of_all, jacobian = problem.residuals_and_jacobian(u)
-    (scene,), ik, prior = problem.data, problem.space.unpack(u), problem.space.size
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
-    return of_all[:-prior], jacobian[:-prior], result
+    return problem.residuals_and_jacobian(u)
 
 
 def evaluate(problem: Problem, u: np.ndarray | jax.Array) -> Evaluated:
-    of_data, jacobian, result = evaluation(*committed((problem, jnp.asarray(u))))
-    return Evaluated(np.asarray(of_data), np.asarray(jacobian), result)
+    prior, result = problem.space.size, playback.run(problem.space.unpack(u), *problem.data)
+    of_all, jacobian = evaluation(*committed((problem, jnp.asarray(u))))
+    return Evaluated(np.asarray(of_all[:-prior]), np.asarray(jacobian[:-prior]), result)
 
 
 def changed(

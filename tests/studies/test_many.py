@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +21,9 @@ from fitting.clips.stances import contacts_path
 from fitting.codegen import crowd, toolchain
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
-from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.motion import playback
+from fitting.motion.playback import Playback
 from fitting.problem.scene import Scene
-from fitting.problem.shared_world import run_scene
 from fitting.runtime import cluster
 from fitting.runtime.claimed_folder import claimed
 from fitting.runtime.precision import with_floats
@@ -247,13 +246,9 @@ def unscaled(scene: Scene) -> Scene:
     return dataclasses.replace(scene, size=jnp.asarray(1.0))
 
 
-@eqx.filter_jit
-def run_alone(ik: jaxik.FootIK, scene: Scene) -> tuple[jax.Array, dict[str, jax.Array], jax.Array]:
-    """Knees, errors, and the cost of a clip alone, as long as it is."""
-    result = run_scene(ik, scene)
-    errors = errors_by_kind(scene, result)
-    residuals = [of_kind.ravel() for of_kind in residuals_by_kind(scene, errors).values()]
-    return result.pose.knee.pos, errors, 0.5 * jnp.sum(jnp.concatenate(residuals) ** 2)
+def run_alone(ik: jaxik.FootIK, scene: Scene) -> Playback:
+    """The motion of a clip alone, with its errors and residuals."""
+    return playback.play(scene, playback.run(ik, scene))
 
 
 def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
@@ -262,10 +257,10 @@ def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
         numbers = fitting.evaluate_many(batch, problem.data, chunk=2)
     assert {values.shape for values in numbers.values()} == {(5, 3)}
     scene = unscaled(problem.data[1])
-    _, errors, cost = run_alone(parameter_tree.replace(ik, {"pelvis.on_gain": GAINS[3]}), scene)
-    assert numbers[COST][3, 1] == pytest.approx(float(cost), rel=1e-10)
-    seen = np.asarray(scene.reference.observed)
-    expected = np.sqrt(np.mean(np.asarray(errors["pelvis"])[seen] ** 2, axis=0).sum())
+    played = run_alone(parameter_tree.replace(ik, {"pelvis.on_gain": GAINS[3]}), scene)
+    cost = 0.5 * sum(np.sum(np.square(of_kind)) for of_kind in played.residuals.values())
+    assert numbers[COST][3, 1] == pytest.approx(cost, rel=1e-10)
+    expected = np.sqrt(np.mean(played.errors["pelvis"][played.seen] ** 2, axis=0).sum())
     assert numbers["pelvis"][3, 1] == pytest.approx(expected, rel=1e-10)
 
 
@@ -300,7 +295,7 @@ def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):
     scene, size = unscaled(problem.data[1]), jnp.asarray(1.3)
     sized = dataclasses.replace(scene, size=size)
     knees, expected, plain = (
-        np.asarray(run_alone(system, clip)[0])
+        run_alone(system, clip).after.knee
         for system, clip in ((ik, sized), (body.similar(ik, size), scene), (ik, scene))
     )
     np.testing.assert_allclose(knees, expected, rtol=1e-9)
