@@ -208,7 +208,7 @@ def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
 
 
 def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_a_floor):
-    walk = edit.trim(on_a_floor, 0.0, 4.0)
+    walk = edit.resample(edit.trim(on_a_floor, 0.0, 4.0), 30.0)
     steps = terrain_of(flight(edges_between_footfalls(walk, 4)[:2], rise=0.45))
     clip, root = place_root(walk, steps, "ground")
     animation = Animation(clip, steps, root=root)
