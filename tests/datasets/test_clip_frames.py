@@ -169,7 +169,7 @@ def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(
     jax.tree.map(np.testing.assert_array_equal, same, flat)
     # Foot IK that changes nothing gives the raised clip.
     nothing = {"lock.enabled": jnp.array(False), "leg.weight": jnp.array(0.0)}
-    ik = parameter_tree.replace(jaxik.presets.record(), nothing)
+    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), nothing)  # as above
     result = jaxik.run(ik, clip.rig, terrain.plane((0.0, -9.0, 0.0)), frames)
     solved = clip_frames.clip_from_result(clip, result, rise=rise)
     raised = clip_frames.raised(clip, rise)
