@@ -5,6 +5,7 @@ include methods and nested functions, arguments include `self`, lines include bl
 """
 
 import ast
+import functools
 import math
 import resource
 import statistics
@@ -98,6 +99,12 @@ class Package:
         return method in own or any(self._overrides(base, method) for base in bases)
 
 
+@functools.cache
+def parsed(name: str) -> Package:
+    """A package, parsed once."""
+    return Package(name)
+
+
 def line_count(path: Path) -> int:
     """Number of lines of a file."""
     return len(path.read_text(encoding="utf-8").splitlines())
@@ -131,6 +138,7 @@ def importers(package: Package) -> dict[Path, set[Path]]:
     return users
 
 
+@functools.cache
 def imported_names(path: Path, tree: ast.Module) -> set[str]:
     """Absolute dotted names of everything that a module imports."""
     folders = path.relative_to(ROOT).parent.parts
@@ -163,7 +171,7 @@ def scattered_subjects(package: Package) -> list[str]:
 
 def package_figures(name: str) -> list[Figure]:
     """What follows from the source of a package alone."""
-    package = Package(name)
+    package = parsed(name)
     lines = sum(map(line_count, package.files))
     folders = Counter(path.parent for path in package.modules)
     small = [folder.name for folder, count in folders.items() if count <= FEW_MODULES]
@@ -209,7 +217,7 @@ def package_figures(name: str) -> list[Figure]:
 def folder_figures(name: str) -> list[Figure]:
     """The lines of each folder of a package."""
     lines: Counter[Path] = Counter()
-    for path in Package(name).files:
+    for path in parsed(name).files:
         lines[path.parent] += line_count(path)
     return [Figure(f"lines of {folder.relative_to(ROOT)}", n) for folder, n in lines.items()]
 

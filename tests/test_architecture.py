@@ -1,7 +1,6 @@
 """The structure of the two packages: who imports whom, and what every file must have."""
 
 import ast
-import functools
 import re
 import sys
 import tomllib
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import house
+from house import parsed
 
 ROOT = house.ROOT
 WINGS = {  # in import order: a wing may import those before it
@@ -29,22 +29,15 @@ ONLY_IMPORTED_BY = {
 }
 
 
-@functools.cache
-def package(name: str) -> house.Package:
-    """Parsed once, and not where tests are only collected."""
-    return house.Package(name)
-
-
 def trees() -> dict[Path, ast.Module]:
     """Of all modules of both packages."""
-    return {path: tree for name in WINGS for path, tree in package(name).trees.items()}
+    return {path: tree for name in WINGS for path, tree in parsed(name).trees.items()}
 
 
 def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-@functools.cache
 def imports(path: Path) -> set[str]:
     """Absolute dotted names of everything that a module imports."""
     return house.imported_names(path, trees()[path])
@@ -69,7 +62,7 @@ def package_and_wing(path: Path) -> tuple[str, str]:
 
 @pytest.mark.parametrize("name", WINGS)
 def test_every_wing_has_its_place_in_the_import_order(name):
-    wings = {package_and_wing(path)[1] for path in package(name).files}
+    wings = {package_and_wing(path)[1] for path in parsed(name).files}
     assert wings - {"__init__"} == set(WINGS[name])
 
 
@@ -85,7 +78,7 @@ def test_a_wing_imports_only_wings_before_it():
 
 def test_a_stage_imports_only_stages_before_it():
     folder, offenders, met = ROOT / "jaxik" / "stages", {}, set()
-    for path in package("jaxik").files:
+    for path in parsed("jaxik").files:
         if folder in path.parents:
             stage = path.relative_to(folder).with_suffix("").parts[0]
             if stage in STAGES:
@@ -98,7 +91,7 @@ def test_a_stage_imports_only_stages_before_it():
 
 def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files():
     allowed = {*LIBRARIES_OF_JAXIK, *sys.stdlib_module_names, "jaxik"} - {"os", "pathlib"}
-    foreign = {name_of(path): imported_packages(path) - allowed for path in package("jaxik").files}
+    foreign = {name_of(path): imported_packages(path) - allowed for path in parsed("jaxik").files}
     assert not {path: names for path, names in foreign.items() if names}
 
 
@@ -117,7 +110,7 @@ def test_a_heavy_library_is_imported_by_one_module_only(library, module):
 def test_everything_public_has_a_docstring():
     bare = [name_of(path) for path, tree in trees().items() if not ast.get_docstring(tree)]
     assert bare == [], "modules without a docstring"
-    missing = {path: package(package_and_wing(path)[0]).undocumented(path) for path in trees()}
+    missing = {path: parsed(package_and_wing(path)[0]).undocumented(path) for path in trees()}
     assert not {name_of(path): names for path, names in missing.items() if names}
 
 

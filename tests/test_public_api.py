@@ -94,7 +94,7 @@ def test_the_api_reference_has_a_page_for_every_module(tmp_path):
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert not done.returncode, done.stderr
     assert (done.stdout, done.stderr) == ("", "")
-    files = [path for name in house.PACKAGES for path in house.Package(name).files]
+    files = [path for name in house.PACKAGES for path in house.parsed(name).files]
     names = [path.parent if path.stem == "__init__" else path.with_suffix("") for path in files]
     pages = {path.relative_to(ROOT).with_suffix(".html").as_posix() for path in names}
     assert not {page for page in pages if not (tmp_path / page).is_file()}

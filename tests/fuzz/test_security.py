@@ -55,7 +55,7 @@ def test_nothing_is_unpickled(name, tmp_path):
 
 @pytest.mark.parametrize("package", house.PACKAGES)
 def test_no_module_unpickles_or_runs_text(package):
-    for path, tree in house.Package(package).trees.items():
+    for path, tree in house.parsed(package).trees.items():
         for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
             name = ast.unparse(call.func)
             keywords = {word.arg: word.value for word in call.keywords}
