@@ -38,6 +38,8 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
         assert f"  {subject}" in done.stdout
     assert f"jax {metadata.version('jax')}," in done.stdout
     assert done.stdout.endswith("\nall is well\n")
+    for extra in ("distributed", "bokeh", "ipykernel", "nbclient", "pandas", "arviz_stats"):
+        (tmp_path / f"{extra}.py").touch()  # is imported at once
     (tmp_path / "jax.py").write_text("raise RuntimeError('no AVX')\n", encoding="utf-8")
     (tmp_path / "rich.py").write_text("raise ImportError('not here')\n", encoding="utf-8")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path))
