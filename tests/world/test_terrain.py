@@ -465,3 +465,27 @@ def test_what_is_no_terrain_is_refused_with_what_was_expected():
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_meshes_of_different_sizes_have_arrays_of_one_shape_and_are_as_they_were():
+    types = set()
+    for size in (2, 9, 15):  # 8 to 450 triangles
+        vertices, triangles = rough(size)
+        ground = terrain.mesh(vertices, triangles, layer=3)
+        (surface,) = ground.surfaces
+        assert isinstance(surface, Mesh)
+        corners, members, layers = surface.on_host()
+        np.testing.assert_array_equal(corners, vertices)
+        np.testing.assert_array_equal(members, triangles)
+        assert (layers == terrain.layer_mask(3)).all()
+        leaves, structure = jax.tree.flatten(ground)
+        types.add((structure, *((leaf.shape, leaf.dtype) for leaf in leaves)))
+        raised = np.asarray(surface.moved(jnp.ones(3)).on_host()[0])
+        np.testing.assert_array_equal(raised, vertices + 1.0)
+    assert len(types) == 1
+
+
+def test_more_vertices_than_a_mesh_has_are_refused():
+    ground = terrain.mesh(*rough(3))
+    with pytest.raises(ValueError, match="at most 512 vertices; got 600"):
+        ground.with_vertices(jnp.zeros((600, 3)))
