@@ -362,23 +362,23 @@ def run(
 ) -> jaxik.Result:
     """`jaxik.run`, by a program that it shares with clips of other lengths; NumPy arrays."""
     count = len(frames.dt)
-    frames, tracks = padded((frames, tracks))
+    frames, tracks = padded_frames((frames, tracks))
     result = jax.device_get(_run(ik, rig, terrain, frames, tracks=tracks))
     return jax.tree.map(lambda x: x[:count], result)
 
 
-def padded(tree: Tree) -> Tree:
-    """Arrays along the frames of a clip with more of its last frame, which change none before it.
+def padded_frames(tree: PyTree) -> Any:
+    """JAX arrays along the frames of a clip, with more of its last one: none before it changes.
 
     They are as long as a multiple of `LENGTH`: each length is a program of its own, which takes
     seconds to compile, and a frame takes microseconds.
     """
 
-    def pad(x: jax.Array) -> jax.Array:
+    def pad(x: jax.Array | np.ndarray) -> jax.Array:
         more = -len(x) % LENGTH
-        if not more:
-            return x
-        rows = np.asarray(x)
-        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)]))
+        if more:
+            rows = np.asarray(x)
+            x = np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)])
+        return jnp.asarray(x)
 
     return jax.tree.map(pad, tree)

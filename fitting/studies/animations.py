@@ -174,9 +174,8 @@ class Animation:
     @cached_property
     def _inputs(self) -> tuple[jaxik.Rig, Terrain, jaxik.Frame, dict[str, Array]]:
         """What does not depend on the system; frames and tracks as long as they are played."""
-        padded = program_cache.padded((self.frames, dict(self.tracks)))
-        arrays = jax.tree.map(jnp.asarray, padded)
-        return program_cache.committed((self.clip.rig, self.terrain, *arrays))
+        padded = program_cache.padded_frames((self.frames, dict(self.tracks)))
+        return program_cache.committed((self.clip.rig, self.terrain, *padded))
 
     def reached(self, result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
         """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.

@@ -12,6 +12,8 @@ from jaxik.world.frame import Frame, Sensed, bearing
 from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
+STAIRS = 0.75  # rise over run of the steepest stairs
+
 
 @struct
 class Inputs:

@@ -21,7 +21,7 @@ from . import cells
 from .cells import SPLIT
 
 LEAST, STEP = 512, 1 << 16  # lengths of arrays: powers of two between them, then steps
-CELLS, ENTRIES = 4, 8  # per triangle, for which most meshes have room
+MOST_CELLS, MOST_ENTRIES = 4, 8  # per triangle, of nearly all meshes
 
 
 def padded(rows: np.ndarray, fill: ArrayLike, least: int = LEAST) -> np.ndarray:
@@ -220,9 +220,9 @@ def build(
         visible=_as_jax(np.where(wall, 0, layers), np.uint32),
         corner=_as_jax(lists.corner, plan.dtype),
         pitch=_as_jax(lists.pitch, plan.dtype),
-        first=_as_jax(padded(lists.first, lists.first[-1], CELLS * len(plan)), np.int32),
-        children=_as_jax(padded(lists.children, -1, CELLS * len(plan)), np.int32),
-        members=_as_jax(padded(lists.members, 0, ENTRIES * len(plan)), np.int32),
+        first=_as_jax(padded(lists.first, lists.first[-1], MOST_CELLS * len(plan)), np.int32),
+        children=_as_jax(padded(lists.children, -1, MOST_CELLS * len(plan)), np.int32),
+        members=_as_jax(padded(lists.members, 0, MOST_ENTRIES * len(plan)), np.int32),
         shape=_as_jax(np.array(lists.shape), np.int32),
         depth=lists.depth,
     )

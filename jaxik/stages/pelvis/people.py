@@ -21,6 +21,7 @@ from jaxik.maths.parameter_tree import (
     switch,
 )
 from jaxik.maths.struct import struct
+from jaxik.stages.inputs import STAIRS
 from jaxik.world.frame import Landing
 from jaxik.world.skeleton import Rig, Transform, mean_position
 
@@ -42,7 +43,6 @@ from .base import (
 
 EARLIEST = 10.0  # landing times before a landing; its share is then less than numbers resolve
 FASTEST = 2.0  # m/s, of a root that climbs; one that is faster has jumped
-STAIRS = 0.75  # rise over run of the steepest stairs
 
 
 @struct
@@ -97,7 +97,8 @@ class AbstractFollowingPelvis(AbstractPelvis):
         risen = self.highest_rise(now, state)
         if risen is not None:
             highest = jnp.where(now.started, state.height + risen, height)
-            velocity = jnp.where(height > highest, risen / now.dt, velocity)
+            pushed = vec.safe_divide(risen, now.dt)
+            velocity = jnp.where(height > highest, pushed, velocity)
             height = jnp.where(height > highest, highest, height)
         height = smoothing.lerp(state.height, height, now.awake)
         ahead = smoothing.lerp(state.ahead, goal.ahead, now.awake * now.progress(rising))
@@ -263,7 +264,7 @@ class ReachPelvis(AbstractFollowingPelvis):
         animated_ws = sensed.unscaled_ankle_ws
         ahead = limiting_ahead(hip_ws, target.pos) - limiting_ahead(sensed.hip_ws, animated_ws)
         ahead *= self.shift
-        ahead = ahead / jnp.sqrt(1.0 + (ahead / self.most_shift) ** 2)
+        ahead *= vec.safe_divide(self.most_shift, vec.safe_sqrt(self.most_shift**2 + ahead**2))
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
         level_ws = animated_ws + ends.way_ws
         landing_ws = target.pos + ends.way_ws + vec.scale(sensed.leg_up_ws, ends.rise)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, duration, option, ratio, switch, threshold
 from jaxik.maths.smoothing import Deviation, clip_to_one, lerp, settle, smoothstep
-from jaxik.stages.inputs import GroundMoment, Inputs
+from jaxik.stages.inputs import STAIRS, GroundMoment, Inputs
 from jaxik.world.frame import Contact, GroundHits, Landing, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
@@ -25,7 +25,6 @@ from .swing import FAR, Level, s_curve
 
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
-STAIRS = 0.75  # rise over run of the steepest stairs
 STAYS = 2.0  # of a sole, that other ground has to support more than that to which a foot swings
 SOONEST, LATEST = 0.06, 0.2  # s, in which a foot slides to what holds it better
 SPREAD = 0.4  # of the way that is left: how far from a predicted foothold the foot may land

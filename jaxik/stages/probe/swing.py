@@ -62,12 +62,12 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     People who step up, down or over something lift a foot later than on the flat, but higher, and
     point their toes to the ground on which they will land. How much, follows from the step's height
     and from how far the ground on the way stands over both footholds. A foot that follows the other
-    up is lifted most; what leads beyond the other foot's ground, the less the higher it is, and on
-    the highest steps not at all. Each part is a bump over the
-    time of the swing, `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape
-    was read off a captured walk over blocks; where the ground is as even as in the animation
-    nothing is added. Steps higher than `highest_step`, the highest of that walk, add no more than
-    it does: several stairs at once are no reason to lift a foot far above them.
+    up is lifted most; one that leads, beyond the other foot's ground, the less the higher it goes,
+    and onto the highest steps not at all. Each part is a bump over the time of the swing,
+    `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape was read off a
+    captured walk over blocks; where the ground is as even as in the animation nothing is added.
+    Steps higher than `highest_step`, the highest of that walk, add no more than it does: several
+    stairs at once are no reason to lift a foot far above them.
     """
 
     clearance: Leaf = length(
