@@ -588,6 +588,8 @@ CAUSES = {
     "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
     "limit": "the system refuses the ground: {3} is {4}, and feet stand on it with {5}",
+    "off": "the system leaves {0:.0%} of these feet as animated: by a rule of its own, foot IK is "
+    "off there, as that of `unreal` while the character moves",
     "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
 }
 
@@ -597,7 +599,7 @@ class Cause(NamedTuple):
 
     kind: str
     amount: float = 0.0
-    """`offset`: m. `units`: metres for each unit of the terrain."""
+    """`offset`: m. `units`: metres for each unit of the terrain. `off`: 0..1, part of the feet."""
     limit: tuple[str, str, str] = ("", "", "")
     """`limit`: the parameter, its value, and one with which feet stand."""
 
@@ -623,7 +625,8 @@ def likely_cause(
     - `units`: the feet follow the ground by the factor of a unit of length.
     - `offset`: all feet are too high or too low by the same amount.
     - `root`: the higher the ground, the deeper they are in it.
-    - `unknown`: none of these; `limit`, a cause in the system, is for those who know that to find.
+    - `unknown`: none of these; `limit` and `off`, causes in the system, are for those who know that
+      to find.
 
     Args:
         feet: the soles of the animation.

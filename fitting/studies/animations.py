@@ -57,6 +57,7 @@ from .fit import run_folder
 # Of ground that a probe accepts, and by how much `_binding_limit` raises one until feet stand.
 LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
 RAISED = (1.25, 1.5, 2.0, 3.0)
+UNMOVED = 1e-3  # m, from the animated ankle: a foot that foot IK leaves alone
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
 
@@ -228,8 +229,16 @@ class Animation:
         soles = self.soles(animated)
         cause = measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
         if cause.kind == "unknown" and ik is not None:
-            return self._binding_limit(motion, ik) or cause
+            return self._binding_limit(motion, ik) or self._off(motion) or cause
         return cause
+
+    def _off(self, motion: measures.PlacedMotion) -> measures.Cause | None:
+        """That a system has left most of the feet that stand off the ground as animated."""
+        off = motion.soles.stance & (np.abs(motion.soles.gap) > motion.measures.visible)
+        moved = motion.clip.joints_ws(2) - self.placed_clip.joints_ws(2)
+        unmoved = off & (np.linalg.norm(moved, axis=-1) < UNMOVED)
+        share = float(unmoved.sum() / max(int(off.sum()), 1))
+        return measures.Cause("off", share) if share > 0.5 else None
 
     def _binding_limit(
         self, motion: measures.PlacedMotion, ik: jaxik.FootIK

@@ -228,6 +228,9 @@ def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_
     assert raised.measures.contact > refused.measures.contact + 0.1
     without_system = animation.cause(refused)
     assert without_system is not None and without_system.kind == "unknown"
+    never = parameter_tree.replace(low, {name: 0.45, "leg.weight": 0.0})
+    idle = animation.cause(play(never), never)
+    assert idle is not None and idle.kind == "off" and idle.amount == 1.0
 
 
 def test_a_system_with_a_root_rule_of_its_own_leaves_a_placed_root_alone(walk, monkeypatch):
