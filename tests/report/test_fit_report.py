@@ -59,7 +59,7 @@ pelvis = { on_gain = 0.5, vertical_only = true }
 probe.toe_ls = [0.0, -0.07, 0.2]
 noise.ankle = 0.01
 """
-CLIP_PLOTS = ("motion", "side_view", "knees", "residuals", "locks", "noise")
+CLIP_PLOTS = ("motion", "side_view", "moments", "knees", "residuals", "locks", "noise")
 SIGMAS = {"ankle": 0.02, "pelvis": 0.03, "foot": 0.1, "contact": 0.5, "smooth": 20.0}
 SIGMAS |= {"knee": 0.03, "body": 0.2, "correlation": 0.4}
 

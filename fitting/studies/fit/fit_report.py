@@ -232,6 +232,7 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
     for name, subject, draw in (
         ("motion", "heights of feet and pelvis", lambda t: fit_plots.motion(after, legs, t)),
         ("side_view", "legs over the ground", lambda t: fit_plots.side_view(after, legs, t)),
+        ("moments", "where it differs most", lambda t: fit_plots.moments(after, legs, t)),
         ("knees", "knee angles", lambda t: fit_plots.knees(after, legs, limits, t)),
         ("residuals", "residuals", lambda t: fit_plots.residuals(first, after, t)),
         ("locks", "contact and locks", lambda t: fit_plots.locks(after, legs, t)),
