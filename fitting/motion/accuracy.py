@@ -75,6 +75,7 @@ class Accuracy(Figures):
 
 
 ACCURACY = Accuracy.measures()
+IN_BRIEF = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "lift_change")
 
 
 @dataclass(frozen=True)

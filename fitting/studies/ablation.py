@@ -21,7 +21,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import jaxik
 from fitting.clips import Clip, edit
 from fitting.experiment import file_tables
 from fitting.experiment.experiment import ClipEntry, Experiment
@@ -32,7 +31,7 @@ from fitting.experiment.problems import ClipData, load_clip_data, problem_from_c
 from fitting.experiment.systems import leaf_names
 from fitting.ground.ground_path import place_root
 from fitting.inference.sample.blocks import SamplerSettings
-from fitting.motion.accuracy import ACCURACY, Accuracy, Errors, clip_errors, summarise
+from fitting.motion.accuracy import ACCURACY, IN_BRIEF, Accuracy, summarise
 from fitting.report import pages, style
 from fitting.report.document import (
     Block,
@@ -53,9 +52,8 @@ from fitting.runtime.json_files import Finite, JsonFile, checked
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, error_context
-from jaxik.world.body import similar
 
-from .animations import Animation
+from .animations import capture_errors
 from .campaign import Campaign
 from .fit.assess import search_with_noise
 from .fit.fit import SearchRecord, record_search
@@ -64,7 +62,6 @@ from .output import as_experiment, output_folder, publish
 NUMBERS = "contribution.json"
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
-IN_BRIEF = ("pelvis", "ankle", "ankle_stance", "knee", "knee_angle", "straight", "lift_change")
 
 MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
 
@@ -287,15 +284,11 @@ def _fit(task: Task) -> Row:
     with activity.announced("Measuring how far it is from the capture"):
         accuracy = summarise(
             [
-                _errors(_for_body(ik, variant.size(clip.base.rig, first)), clip, frames)
+                capture_errors(ik, clip, variant.size(clip.base.rig, first), frames)
                 for clip, frames in data.measured
             ]
         )
     return Row(task.key, task.name, task.part, accuracy, values, record)
-
-
-def _for_body(ik: jaxik.FootIK, size: float | None) -> jaxik.FootIK:
-    return ik if size is None else similar(ik, size)
 
 
 def _at_rate(data: ClipData, fps: float | None) -> ClipData:
@@ -306,15 +299,6 @@ def _at_rate(data: ClipData, fps: float | None) -> ClipData:
     nearest = np.round(np.arange(base.frame_count) * data.base.fps / fps).astype(int)
     tracks = {name: values[nearest] for name, values in data.tracks.items()}
     return ClipData(reference, base, data.terrain, root, tracks)
-
-
-def _errors(ik: jaxik.FootIK, data: ClipData, frames: slice) -> Errors:
-    """Errors of the system in these frames, at the clip's own rate."""
-    animation = Animation(data.base, data.terrain, root=data.root, tracks=data.tracks)
-    animation.check_shapes(ik)
-    _, solved = animation.solve(ik)
-    compared = (solved, data.reference, animation.placed_clip)
-    return clip_errors(*(clip.select(frames) for clip in compared))
 
 
 def _digest(entries: Sequence[ClipEntry]) -> str:

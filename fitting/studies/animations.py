@@ -32,6 +32,7 @@ from fitting.clips.formats.saving import check_clip_file
 from fitting.clips.joint_maps import Trunk, find_trunk
 from fitting.clips.load import ClipOptions
 from fitting.experiment import systems, track_files
+from fitting.experiment.problems import ClipData
 from fitting.ground import coverage, meshes
 from fitting.ground.ground_path import AS_ANIMATED, Root, RootChoice, place_root
 from fitting.ground.meshes import TerrainOptions, mesh_of
@@ -291,6 +292,27 @@ class Animation:
     def soles(self, solved: Clip) -> measures.Soles:
         """The soles of a motion over the ground."""
         return measures.soles(solved, self.own_speed, self.terrain, self.floor)
+
+
+def capture_errors(
+    ik: jaxik.FootIK, data: ClipData, size: float | None, frames: slice = slice(None)
+) -> accuracy.Errors:
+    """Errors of a system on a clip of an experiment, in these frames, at the clip's own rate.
+
+    Args:
+        ik: the system, for the body that the experiment's numbers are for.
+        data: the clip, at its own rate.
+        size: of its body; see `Experiment.size`.
+        frames: that count; all are played.
+
+    Raises:
+        ValueError: a parameter has too many values for the rig, or the poses are not finite.
+    """
+    animation = Animation(data.base, data.terrain, root=data.root, tracks=data.tracks)
+    animation.check_shapes(ik)
+    _, solved = animation.solve(ik if size is None else body.similar(ik, size))
+    compared = (solved, data.reference, animation.placed_clip)
+    return accuracy.clip_errors(*(clip.select(frames) for clip in compared))
 
 
 def has_other_path(animation: AnimationFiles | Animation) -> bool:
