@@ -1,5 +1,8 @@
 """An experiment's clips fitted each alone, all pooled, and as a population, and what they show.
 
+Where they show two or more subjects, each subject is also measured with parameters that were fitted
+on others, or on its own other clips.
+
 Each search has a file whose name is a digest of its problem, settings and seed. An interrupted
 study that is called again reads the finished searches, and continues the one that was running
 after its last stage.
@@ -7,10 +10,10 @@ after its last stage.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple, TypeAlias, TypedDict
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,7 +27,7 @@ from fitting.experiment import file_tables, parameter_files
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.experiment_files import experiment_to_toml
 from fitting.experiment.in_memory import with_files
-from fitting.experiment.problems import make_problem
+from fitting.experiment.problems import load_clip_data, make_problem
 from fitting.experiment.systems import Preset
 from fitting.inference.mixed_model import (
     Draws,
@@ -37,19 +40,32 @@ from fitting.inference.mixed_model import (
 )
 from fitting.inference.noise import NoiseModel, NoiseOptions, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
-from fitting.motion.accuracy import position_error
+from fitting.motion import accuracy
+from fitting.motion.accuracy import ACCURACY, IN_BRIEF, Accuracy, position_error
 from fitting.problem.problem import Problem
 from fitting.problem.space import INTERVAL, Space
 from fitting.report import pages, style
-from fitting.report.document import Document, Finding, Grid, Plot, Points, Section, Text
-from fitting.report.formatting import Table, counted, interval, listed, number
+from fitting.report.document import (
+    Block,
+    Document,
+    Finding,
+    Grid,
+    Plot,
+    Points,
+    Section,
+    Terms,
+    Text,
+)
+from fitting.report.formatting import Table, counted, interval, listed, meanings, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES
 from fitting.runtime import activity, files
 from fitting.runtime.json_files import Finite, JsonFile
 from fitting.runtime.precision import in_float64
 from fitting.runtime.store import Store
+from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 
+from .animations import capture_errors
 from .campaign import Campaign, clip_names
 from .fit import run_folder
 from .fit.assess import search_identity, search_with_noise
@@ -75,6 +91,15 @@ ERRORS = (
     "the others, and with those that the population of the others expects of it."
 )
 
+CROSSED = (
+    "A subject's clips with parameters that were fitted, pooled, on clips of which none is the one "
+    "that is measured; **nothing** is the system of the experiment as it comes. Measured at the "
+    "rate of the clips."
+)
+NOTHING, OWN, OTHERS, ALL = (
+    "nothing", "the subject's other clips", "other subjects", "all other clips"
+)  # fmt: skip
+
 ERROR_NAMES = {
     "alone": "fitted alone",
     "pooled": "pooled",
@@ -83,6 +108,8 @@ ERROR_NAMES = {
     "left_out_population": "left out, population",
 }
 CM = 100.0  # in a metre
+MINUTE = 60.0  # s
+Clips: TypeAlias = frozenset[int]
 
 APART = 0.16  # of a row, from its middle to an estimate
 COLOURS = dict(zip(ERROR_NAMES, (BEFORE, CAPTURED, AFTER, STAGES[1], STAGES[4]), strict=True))
@@ -303,13 +330,84 @@ class ClipErrors:
     """As expected from the population of all others, and of the clip's subject if they show it."""
 
 
-def without_clip(problem: Problem[jaxik.FootIK], clip: int) -> Problem[jaxik.FootIK]:
-    """The problem in which a clip does not count: none of its frames was observed.
+def with_clips(problem: Problem[jaxik.FootIK], clips: Clips) -> Problem[jaxik.FootIK]:
+    """The problem in which only these clips count: no frame of another one was observed.
 
-    The clip is still played, so that the whole problem's programs can be used.
+    The others are still played, so that the whole problem's programs can be used.
     """
-    observed = problem.data[clip].reference.observed
-    return eqx.tree_at(lambda p: p.data[clip].reference.observed, problem, jnp.zeros_like(observed))
+    for c, scene in enumerate(problem.data):
+        if c not in clips:
+            none = jnp.zeros_like(scene.reference.observed)
+            problem = eqx.tree_at(lambda p, c=c: p.data[c].reference.observed, problem, none)
+    return problem
+
+
+class Crossing(NamedTuple):
+    """The clips of a subject, and on which clips the parameters of each are fitted."""
+
+    subject: str
+    fitted_on: str
+    """In words."""
+    fits: dict[int, Clips]
+    """Fitted clips by measured one; none of them leaves the system as it comes."""
+
+
+def crossings(subjects: Sequence[str]) -> list[Crossing]:
+    """What is fitted on and measured; nothing where there is only one subject.
+
+    A subject with a single clip has no other ones, and all other clips are those of the others.
+    """
+    everybody = frozenset(range(len(subjects)))
+    crossed = []
+    for subject in dict.fromkeys(subjects):
+        own = frozenset(c for c in everybody if subjects[c] == subject)
+        rows = {NOTHING: dict.fromkeys(sorted(own), Clips())}
+        if len(own) > 1:
+            rows[OWN] = {c: own - {c} for c in sorted(own)}
+        rows[OTHERS] = dict.fromkeys(sorted(own), everybody - own)
+        if len(own) > 1:
+            rows[ALL] = {c: everybody - {c} for c in sorted(own)}
+        crossed += [Crossing(subject, words, fits) for words, fits in rows.items()]
+    return crossed if own != everybody else []
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossedErrors:
+    """How far the clips of a subject are from the capture with parameters of others."""
+
+    subject: str
+    fitted_on: str
+    """In words."""
+    accuracy: Accuracy
+
+
+def measure_crossings(
+    experiment: Experiment,
+    space: Space[jaxik.FootIK],
+    crossed: Sequence[Crossing],
+    fits: Mapping[Clips, SearchResult],
+) -> list[CrossedErrors]:
+    """The errors of each row, at the clips' own rate, with these fits of sets of clips.
+
+    Raises:
+        ValueError: as `capture_errors`.
+    """
+    if not crossed:
+        return []
+    with activity.announced("Reading the clips at their own rate"):
+        data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
+    sizes = [experiment.size(clip.base.rig, data[0].base.rig) for clip in data]
+    rows = []
+    with activity.announced("Measuring subjects with what others gave", len(crossed)) as measuring:
+        for subject, fitted_on, of_clips in crossed:
+            errors = []
+            for c, fitted in of_clips.items():
+                u = jnp.asarray(fits[fitted]["u"]) if fitted else None
+                ik = space.system if u is None else space.unpack(u)
+                errors.append(capture_errors(ik, data[c], sizes[c]))
+            rows.append(CrossedErrors(subject, fitted_on, accuracy.summarise(errors)))
+            measuring.advance()
+    return rows
 
 
 def predict(
@@ -347,6 +445,8 @@ class PopulationSummary(TypedDict):
     """m, of the body that the values are for; None if they fit any body as they are."""
     parameters: list[ParameterEstimates]
     errors: list[dict[str, str | float]]
+    crossed: list[Content]
+    """The rows of `CrossedErrors`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -360,13 +460,12 @@ class Population:
     """A name for each."""
     subjects: tuple[str, ...]
     """The subject of each; the clip's own name where the experiment names none."""
-    alone: tuple[SearchResult, ...]
-    pooled: SearchResult
-    others: tuple[SearchResult, ...]
-    """All clips but each, pooled."""
+    searches: tuple[SearchResult, ...]
+    """Of each clip alone, then of all and of some, pooled."""
     fit: PopulationFit
     parameters: list[ParameterEstimates]
     errors: list[ClipErrors]
+    crossed: list[CrossedErrors]
 
     @property
     def converged(self) -> bool:
@@ -376,8 +475,7 @@ class Population:
     @property
     def unconverged(self) -> list[str]:
         """What has not converged, in a sentence each."""
-        searches = (*self.alone, self.pooled, *self.others)
-        lines = [f"{of['name']}: {of['message']}" for of in searches if not of["converged"]]
+        lines = [f"{of['name']}: {of['message']}" for of in self.searches if not of["converged"]]
         if not self.fit.converged:
             lines.append(f"population: not converged after {self.fit.rounds} rounds")
         return lines
@@ -399,6 +497,10 @@ class Population:
             "leg_length": self.leg_length,
             "parameters": self.parameters,
             "errors": [dataclasses.asdict(row) for row in self.errors],
+            "crossed": [
+                {"subject": row.subject, "fitted_on": row.fitted_on, **row.accuracy.numbers()}
+                for row in self.crossed
+            ],
         }
 
 
@@ -409,6 +511,8 @@ def fit_clips_and_population(
     folder: Path | None = None,
 ) -> Population:
     """Fits each clip alone, all pooled, the population, and all without each clip in turn.
+
+    Where there are several subjects, it also fits what `crossings` names.
 
     Noise that the experiment estimates is estimated in each clip alone, where no difference between
     clips counts as noise, and is taken from there.
@@ -437,17 +541,28 @@ def fit_clips_and_population(
     ]
     whole = _joined(problem, problems)
     known = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
-    rests = [f"{EVERYTHING} but {name}" for name in clips]
-    tasks = [_task(EVERYTHING, whole, known)]
-    tasks += [_task(rest, without_clip(whole, c), known) for c, rest in enumerate(rests)]
-    pooled, *others = _search_all("Fitting all clips, and all but each", tasks, folder)
-    alone_u, pooled_u = np.array([result["u"] for result in alone]), np.array(pooled["u"])
+    everything, crossed = Clips(range(len(clips))), crossings(subjects)
+    fits = {Clips([c]): result for c, result in enumerate(alone)}
+    sets = {everything: EVERYTHING}
+    sets |= {everything - {c}: f"{EVERYTHING} but {name}" for c, name in enumerate(clips)}
+    for subject, fitted_on, of_clips in crossed:
+        for c, fitted in of_clips.items():
+            which = f"of {subject} but {clips[c]}" if fitted_on == OWN else f"but {subject}'s"
+            sets.setdefault(fitted, f"{EVERYTHING} {which}")
+    sets = {fitted: name for fitted, name in sets.items() if fitted and fitted not in fits}
+    tasks = [_task(name, with_clips(whole, fitted), known) for fitted, name in sets.items()]
+    pooled = _search_all("Fitting all clips, and some of them", tasks, folder)
+    fits |= zip(sets, pooled, strict=True)
+    alone_u, pooled_u = (
+        np.array([result["u"] for result in alone]),
+        np.array(fits[everything]["u"]),
+    )
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     with activity.announced("Fitting the population"):
         fit = fit_population(problems, grouping, starts)
     errors = []
     for c, name in enumerate(clips):
-        others_u = np.array(others[c]["u"])
+        others_u = np.array(fits[everything - {c}]["u"])
         with activity.announced(f"Predicting {name} from the others"):
             expected = predict(problems, grouping, fit, others_u, c)
             points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
@@ -458,12 +573,11 @@ def fit_clips_and_population(
         problem=problem,
         clips=clips,
         subjects=subjects,
-        alone=tuple(alone),
-        pooled=pooled,
-        others=tuple(others),
+        searches=tuple(fits.values()),
         fit=fit,
         parameters=summarise(problems, alone_u, pooled_u, fit, levels),
         errors=errors,
+        crossed=measure_crossings(experiment, problem.space, crossed, fits),
     )
 
 
@@ -501,6 +615,8 @@ def document(population: Population) -> Document:
                 ],
             ),
             Section("Errors", [Grid(error_table(population), "Errors"), Text(ERRORS)]),
+            Section("Subjects crossed", _crossed(population)),
+            Section("Searches", [Grid(search_table(population), "Searches", brief=False)]),
             Section("In detail", [Points(remarks(population), brief=True)]),
             _limits(population),
         ],
@@ -568,6 +684,33 @@ def error_table(population: Population) -> Table:
     for row in population.errors:
         table.append([row.clip, *(f"{CM * getattr(row, key):.2f}" for key in ERROR_NAMES)])
     table.append(["all", *(f"{CM * mean_error(population, key):.2f}" for key in ERROR_NAMES)])
+    return table
+
+
+def _crossed(population: Population) -> list[Block]:
+    """Nothing where there is one subject."""
+    if not population.crossed:
+        return []
+    table = Grid(crossed_table(population), "Errors of subjects with parameters of others")
+    meaning = Terms(meanings({key: ACCURACY[key] for key in IN_BRIEF}))
+    return [table, Text(CROSSED), meaning]
+
+
+def crossed_table(population: Population) -> Table:
+    """A row for each subject and what its parameters were fitted on."""
+    table = [["subject", "fitted on", *(ACCURACY[key].title for key in IN_BRIEF)]]
+    for row in population.crossed:
+        figures = (row.accuracy.text(key) for key in IN_BRIEF)
+        table.append([row.subject, row.fitted_on, *figures])
+    return table
+
+
+def search_table(population: Population) -> Table:
+    """A row for each search."""
+    table = [["fitted", "cost", "starts that agree", "minutes"]]
+    for of in population.searches:
+        agreeing = f"{of['agreeing']} of {of['starts']}"
+        table.append([of["name"], number(of["cost"]), agreeing, f"{of['seconds'] / MINUTE:.1f}"])
     return table
 
 
@@ -669,7 +812,7 @@ def _convergence(population: Population) -> Finding:
             f"the search: {listed(lines).rstrip('.')}.",
             bad=True,
         )
-    count = len(population.alone) + len(population.others) + 1
+    count = len(population.searches)
     return Finding(f"All {count} searches and the fit of the population converged.")
 
 
@@ -738,8 +881,9 @@ def population(
     """Fits the clips of an experiment each alone, all pooled, and as a population.
 
     What varies between clips or subjects stands in the experiment's table [hierarchy]. Each clip is
-    also predicted from the others. Each finished search is written at once, and a call with the
-    same folder continues where an interrupted one ended.
+    also predicted from the others, and each subject measured with parameters that were fitted on
+    others. Each finished search is written at once, and a call with the same folder continues where
+    an interrupted one ended.
 
     Args:
         experiment: an experiment, or the path of its file.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import fitting
+import jaxik
 from fitting.cli import main
 from fitting.experiment import parameter_files
 from fitting.experiment.experiment import ClipEntry
@@ -95,6 +96,60 @@ def test_a_subject_that_others_show_is_expected_as_they_show_it(tmp_path, monkey
     assert gain["clips"][0]["value"] == gain["clips"][1]["value"] < gain["clips"][2]["value"]
 
 
+def test_a_subject_is_crossed_with_others_and_with_its_own_other_clips():
+    rows = {
+        (subject, fitted_on): [sorted(clips) for clips in fits.values()]
+        for subject, fitted_on, fits in population.crossings("abbb")
+    }
+    assert rows == {
+        ("a", population.NOTHING): [[]],
+        ("a", population.OTHERS): [[1, 2, 3]],
+        ("b", population.NOTHING): [[], [], []],
+        ("b", population.OWN): [[2, 3], [1, 3], [1, 2]],
+        ("b", population.OTHERS): [[0], [0], [0]],
+        ("b", population.ALL): [[0, 2, 3], [0, 1, 3], [0, 1, 2]],
+    }
+    assert population.crossings("bbb") == []
+
+
+def test_subjects_are_measured_with_parameters_that_others_gave(fitted):
+    own = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
+    gains = np.array(MEASURED)[:, 0]
+    expected = {  # the clips are raised by the gain, and captured near to the animation
+        ("ann", population.NOTHING): [own, own],
+        ("ann", population.OWN): gains[[1, 0]],
+        ("ann", population.OTHERS): gains[[2, 2]],
+        ("ann", population.ALL): [gains[1:].mean(), gains[[0, 2]].mean()],
+        ("ben", population.NOTHING): [own],
+        ("ben", population.OTHERS): [gains[:2].mean()],
+    }
+    rows = {(row.subject, row.fitted_on): row.accuracy.pelvis for row in fitted.crossed}
+    assert rows.keys() == expected.keys()
+    below = rows["ben", population.OTHERS] - gains[:2].mean()  # the capture of the last clip
+    for key, raised in expected.items():
+        near = below if key[0] == "ben" else 0.0
+        rms = np.sqrt(np.mean(np.square(np.asarray(raised) + near)))
+        assert rows[key] == pytest.approx(rms, abs=0.01)
+
+
+def test_each_set_of_clips_is_fitted_once(tmp_path, monkeypatch):
+    searched: list[list[str]] = []
+
+    def watched(title, tasks, folder):
+        searched.append([task.name for task in tasks])
+        if len(searched) == 2:
+            raise KeyboardInterrupt
+        return [{"name": task.name, "u": [0.0, 0.0]} for task in tasks]
+
+    monkeypatch.setattr(population, "_search_all", watched)
+    path = small_studies.quick_population(tmp_path, monkeypatch, [(0.2, 0.4)] * 4, subjects="abbb")
+    with pytest.raises(KeyboardInterrupt):
+        fitting.population(path)
+    alone, pooled = searched
+    assert pooled[:5] == ["all clips", *(f"all clips but {name}" for name in alone)]
+    assert pooled[5:] == [f"all clips of b but {name}" for name in alone[1:]]
+
+
 def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
     estimated: list[int] = []
     search = population.search_with_noise
@@ -152,8 +207,11 @@ def test_the_folder_has_a_report_and_parameters(made):
     page = Page(out / pages.PAGE)
     assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
     assert "All 7 searches and the fit of the population converged." in page.text
+    assert "ann other subjects 30." in page.text and "all clips 58.97 2 of 2 " in page.text
     assert page.elements.count("img") == 1 and "uneven_walk from 1 s (ann)" in page.text
     numbers = json.loads((out / "population.json").read_text())
+    assert numbers["crossed"][2]["fitted_on"] == population.OTHERS
+    assert numbers["crossed"][2]["pelvis"] == pytest.approx(0.3, abs=0.01)
     assert numbers["converged"] and numbers["subjects"] == list(SUBJECTS)
     assert [row["name"] for row in numbers["parameters"]] == ["pelvis.on_gain", "foot.max_pitch"]
     assert load_experiment(out / "experiment.toml").hierarchy.per_clip == ("pelvis.on_gain",)

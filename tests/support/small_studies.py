@@ -59,6 +59,12 @@ def lift(animation, ik):
     return None, base.with_motion(base.positions_ws + up, base.rotations_ws)
 
 
+def without_solver(patch: MonkeyPatch) -> None:
+    """Replaces the pipeline of animations by `lift`."""
+    patch.setattr(Animation, "solve", lift)
+    patch.setattr(Animation, "check_shapes", lambda *_: None)
+
+
 SCENES: dict = {}  # by clip: making one takes longer than the test that uses it
 
 
@@ -75,8 +81,7 @@ def without_pipeline(patch: MonkeyPatch) -> None:
         return SCENES[key]
 
     patch.setattr(problems, "make_scene", cached)
-    patch.setattr(Animation, "solve", lift)
-    patch.setattr(Animation, "check_shapes", lambda *_: None)
+    without_solver(patch)
     patch.setattr(ablation.jax, "clear_caches", lambda: None)
 
 
@@ -112,11 +117,17 @@ def quick_calibration(folder: Path, patch: MonkeyPatch, **wrong: float) -> Path:
 # Population
 
 
-def write_population(folder: Path, rest: str = VARYING, top: str = "", free: str = FREE) -> Path:
-    """Three clips of a tenth of a second."""
+def write_population(
+    folder: Path,
+    rest: str = VARYING,
+    top: str = "",
+    free: str = FREE,
+    subjects: Sequence[str] = SUBJECTS,
+) -> Path:
+    """A clip of a tenth of a second for each subject."""
     clips = "".join(
         f'{CLIP}start = {c}.0\nend = {c}.1\nsubject = "{subject}"\n'
-        for c, subject in enumerate(SUBJECTS)
+        for c, subject in enumerate(subjects)
     )
     return write(folder, "walks.toml", top=SQUARES + top, clips=clips, free=free, rest=rest)
 
@@ -129,14 +140,19 @@ def error_at(problem, u) -> float:
 
 
 def quick_population(
-    folder: Path, patch: MonkeyPatch, measured: Sequence = MEASURED, rest: str = VARYING
+    folder: Path,
+    patch: MonkeyPatch,
+    measured: Sequence = MEASURED,
+    rest: str = VARYING,
+    subjects: Sequence[str] = SUBJECTS,
 ) -> Path:
     """A population whose clips are two numbers each."""
     make = problems.make_problem
     patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_references)
     patch.setattr(population, "make_problem", lambda e: quick.with_measured(make(e), measured))
     patch.setattr(population, "error_at", error_at)
-    return write_population(folder, rest)
+    without_solver(patch)
+    return write_population(folder, rest, subjects=subjects)
 
 
 # Many fits
