@@ -165,7 +165,13 @@ BLOCKS, CLIMB = (1141,), (120, 107, 126, 128)  # frames of each clip: 38 s, and 
 
 @pytest.mark.parametrize(
     ("name", "lengths"),
-    [("blocks", BLOCKS), ("blocks_walk", BLOCKS), ("blocks_causal", BLOCKS), ("climb", CLIMB)],
+    [
+        ("blocks", BLOCKS),
+        ("blocks_walk", BLOCKS),
+        ("blocks_causal", BLOCKS),
+        ("climb", CLIMB),
+        ("two_grounds", (622, 520, *CLIMB)),
+    ],
 )
 def test_the_experiments_on_captured_ground_make_a_problem(mocap, name, lengths):
     path = ROOT / "data" / "experiments" / f"{name}.toml"
