@@ -236,7 +236,8 @@ def population(options: argparse.Namespace) -> int:
     jaxik population walks.toml -o runs/walks
 
     The experiment's table [hierarchy] says what varies between clips or subjects. Each clip is
-    fitted alone, all are pooled, and as a population; and each is predicted from the others.
+    fitted alone, all are pooled, and as a population; each is predicted from the others, and each
+    subject measured with parameters of others.
     Each search is written when it is done: after Ctrl-C (status 130) the same command
     continues. Status 0: converged. 3: not converged.
     """
