@@ -24,7 +24,7 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
@@ -159,11 +159,12 @@ def array_type(array: jax.Array) -> ArrayType:
     return ArrayType(aval.shape, str(aval.dtype), aval.weak_type)
 
 
-def program_key(function: Callable, arguments: Arguments) -> str:
+def program_key(function: Callable, arguments: Arguments, platform: str = "cpu") -> str:
     """A digest of everything that a function's program is traced from.
 
-    That is the function, the static part of its arguments, the types of their arrays, JAX's
-    settings, the source of this project and the versions of the libraries.
+    That is the function, the static part of its arguments, the types of their arrays, JAX's name
+    of the platform that computes, its settings, the source of this project and the versions of the
+    libraries.
 
     Raises:
         NotPlainError: the function or an argument comes from elsewhere, where source may change
@@ -177,7 +178,7 @@ def program_key(function: Callable, arguments: Arguments) -> str:
     parts = [
         [module, name],
         plain_tree.describe(types),
-        [jax.default_backend(), *settings],
+        [platform, *settings],
         versions(),
         sources(),
     ]
@@ -219,37 +220,39 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 
     name = function.__name__.strip("_").replace("_", " ")
 
-    def from_cache(*args: Inputs.args, **named: Inputs.kwargs) -> Any:
-        arguments = (args, named)
+    def from_cache(platform: str | None, arguments: Arguments) -> Any:
+        args, named = arguments
+        whole: Callable[..., Any] = function
         if (work := activity.innermost()) is not None:
             work.began_compiling(name)
-        if (place := _place(function, arguments)) is None:
-            return function(*args, **named)
+        if platform is None or (place := _place(function, arguments, platform)) is None:
+            return whole(*args, **named)
         program, failure = _read(place), ""
         if program is None:
             try:
-                program = _trace(function, arguments)
+                program = _trace(function, arguments, platform)
             except Exception as error:
                 failure = str(error).partition("\n")[0]
             else:
                 _write(place, program)
         if program is None:
-            output = function(*args, **named)  # raises the error if the call itself is wrong
+            output = whole(*args, **named)  # raises the error if the call itself is wrong
             warn_once(f"the program of {function.__name__} is not cached", failure)
             return output
         return program.call(jax.tree.leaves(eqx.filter(arguments, eqx.is_array)))
 
-    def of_leaves(structure: Any, static: tuple[Any, ...], arrays: list[jax.Array]) -> Any:
+    def of_leaves(
+        structure: Any, static: tuple[Any, ...], platform: str | None, arrays: list[jax.Array]
+    ) -> Any:
         rest = iter(arrays)
         leaves = [next(rest) if leaf is None else leaf for leaf in static]
-        whole: Callable[..., Any] = from_cache
-        args, named = jax.tree.unflatten(structure, leaves)
-        traced, plain = eqx.partition(whole(*args, **named), eqx.is_array)
+        output = from_cache(platform, jax.tree.unflatten(structure, leaves))
+        traced, plain = eqx.partition(output, eqx.is_array)
         return traced, _Plain(plain)
 
     of_leaves.__name__ = function.__name__
     inside = eqx.filter_jit(function)
-    outside = jax.jit(of_leaves, static_argnums=(0, 1))  # much leaner than `filter_jit`
+    outside = jax.jit(of_leaves, static_argnums=(0, 1, 2))  # much leaner than `filter_jit`
 
     @functools.wraps(function)
     def call(*args: Inputs.args, **named: Inputs.kwargs) -> Output:
@@ -260,7 +263,7 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
         static = tuple(None if isinstance(leaf, jax.Array) else leaf for leaf in leaves)
         arrays = [leaf for leaf in _committed(leaves) if isinstance(leaf, jax.Array)]
         try:
-            traced, plain = outside(structure, static, arrays)
+            traced, plain = outside(structure, static, _platform(leaves), arrays)
             return eqx.combine(traced, plain.tree)
         finally:
             if (work := activity.innermost()) is not None:
@@ -297,11 +300,26 @@ def _committed(leaves: list[Any]) -> list[Any]:
     return fixed
 
 
-def _place(function: Callable, arguments: Arguments) -> _Place | None:
+def _platform(leaves: Sequence[Any]) -> str | None:
+    """What computes with these arrays, as programs name it; None where that is not known.
+
+    That is not JAX's default where they are on another device, as on a CPU beside a GPU.
+    """
+    arrays = (leaf for leaf in leaves if isinstance(leaf, jax.Array))
+    known = (array for array in arrays if not isinstance(array, Tracer))
+    devices = next((array.sharding.device_set for array in known), ())
+    default = jax.default_backend()
+    platform = next((device.platform for device in devices), default)
+    if platform == default:
+        return export.default_export_platform()  # which GPU
+    return platform if platform == "cpu" else None
+
+
+def _place(function: Callable, arguments: Arguments, platform: str) -> _Place | None:
     """Where the program for arguments of these types is cached; None if it must not be."""
     try:
         folder = cache_folder.traced()
-        key = program_key(function, arguments)
+        key = program_key(function, arguments, platform)
     except (cache_folder.SwitchedOffError, NotPlainError):
         return None
     except OSError as error:
@@ -325,7 +343,7 @@ def _write(place: _Place, program: Program) -> None:
         warn_once("traced programs are not cached", in_one_line(error))
 
 
-def _trace(function: Callable, arguments: Arguments) -> Program:
+def _trace(function: Callable, arguments: Arguments, platform: str) -> Program:
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     leaves, structure = jax.tree.flatten(dynamic)
     types = [
@@ -346,7 +364,8 @@ def _trace(function: Callable, arguments: Arguments) -> Program:
         return [jnp.asarray(leaf, leaf.dtype) for leaf in arrays]
 
     with TRACING:
-        exported = export.export(jax.jit(flat), disabled_checks=UNSTABLE)(*types)
+        exporting = export.export(jax.jit(flat), platforms=[platform], disabled_checks=UNSTABLE)
+        exported = exporting(*types)
     return Program(exported, outputs[-1])
 
 

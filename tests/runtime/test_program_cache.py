@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax._src import compilation_cache
+from jax._src import compilation_cache, xla_bridge
 from jax._src.lru_cache import LRUCache
 
 from fitting.experiment.experiment_files import load_experiment
@@ -281,6 +281,17 @@ def test_arrays_are_compiled_for_once_wherever_they_come_from(folder):
         jax.monitoring.unregister_event_duration_listener(count)
     assert first.committed and not points.committed
     assert len(compiled) == 1
+
+
+@pytest.mark.parametrize("beside", ["cpu", "tpu"])
+def test_a_program_is_kept_for_the_device_its_arrays_are_on(folder, monkeypatch, beside):
+    """Not for JAX's default, which may be an accelerator beside the CPU that computes."""
+    array = points()
+    monkeypatch.setattr(xla_bridge, "default_backend", lambda: beside)
+    monkeypatch.setattr(jax, "default_backend", lambda: beside)
+    for _ in range(2):
+        np.testing.assert_allclose(fresh()(2.0, array)["half"][0], array / 2)
+    assert len(TRACED) == len(kept(folder)) == 1
 
 
 def test_work_says_what_is_compiled_for_it_and_for_how_long():
