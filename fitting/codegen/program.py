@@ -315,9 +315,10 @@ def exported(function: Callable, trees: tuple) -> export.Exported:
     """A function in StableHLO, of all leaves of these arguments or shapes.
 
     Of arguments only the shapes count: arrays that are committed to a device would bring it along.
+    Lowered for a CPU, as an accelerator that JAX finds here may have calls of its own.
     """
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), trees)
-    return export.export(jax.jit(function, keep_unused=True))(*shapes)
+    return export.export(jax.jit(function, keep_unused=True), platforms=["cpu"])(*shapes)
 
 
 def _blank_hits(shape: tuple[int, ...], platforms: int) -> Hit:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import xla_bridge
 from jaxtyping import Array
 
 import jaxik
@@ -310,6 +311,11 @@ def operated(n: Numbers) -> Outcomes:
         "arcsine": jnp.arcsin(n.x),
     }
     return Outcomes(exact, rounded)
+
+
+def test_programs_are_lowered_for_a_cpu_whatever_accelerator_is_here(monkeypatch):
+    monkeypatch.setattr(xla_bridge, "default_backend", lambda: "tpu")
+    assert program.exported(jnp.sin, (jnp.ones(3),)).platforms == ("cpu",)
 
 
 def program_of(function: Callable, row: Any, ik: jaxik.FootIK, rig: jaxik.Rig) -> program.Program:
