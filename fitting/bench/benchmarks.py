@@ -37,7 +37,7 @@ from fitting.inference.optimise.solution import Solution
 from fitting.inference.sample.blocks import SamplerSettings
 from fitting.inference.sample.posterior import WalkerStart, sample_posterior
 from fitting.problem.problem import Problem
-from fitting.runtime import machine
+from fitting.runtime import machine, xla
 from fitting.runtime.program_cache import committed
 from fitting.runtime.threads import cpu_block, usable_cores
 from fitting.studies import exports
@@ -629,7 +629,8 @@ def _time_cold_fits(measurement: Measurement, sizes: Sizes) -> None:
 
 def first(measurement: Measurement, sizes: Sizes) -> None:
     """Processes that begin with an empty cache and with a full one, imports included."""
-    variables = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    of_user = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    variables = of_user | {k: os.environ[k] for k in xla.PLATFORMS if k in os.environ}
     for number in range(sizes.fits):
         with tempfile.TemporaryDirectory() as parent:
             exports.copy(processes.EXAMPLE, folder := Path(parent, processes.EXAMPLE), "{}")

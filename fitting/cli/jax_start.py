@@ -15,7 +15,7 @@ from fitting.runtime.validation import in_one_line
 
 PARSED = "from jaxlib import xla_client; xla_client.CompileOptions()"  # reads the flags
 REASON = re.compile(r"^[EF]\d{4} [^]]*\] (.*)", re.MULTILINE)  # in what XLA prints as it ends
-OF_DEVICES = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "JAX_NUM_CPU_DEVICES")
+OF_DEVICES = (*xla.PLATFORMS, "JAX_NUM_CPU_DEVICES")
 
 
 class StartError(ValueError):
@@ -28,7 +28,9 @@ class StartError(ValueError):
 
 
 def start() -> None:
-    """Imports JAX, sets what suits these programs, and lets it find its devices.
+    """Imports JAX, sets what suits these programs, and lets it find its devices: the CPU's.
+
+    `JAX_PLATFORMS` names other ones.
 
     Raises:
         StartError: a variable of the environment has a value that JAX or XLA refuses, or there is
@@ -42,10 +44,11 @@ def start() -> None:
     except ValueError as error:
         raise about_variable(error) or error from None
     xla.ignore_debugging()
+    names = [name for name in OF_DEVICES if name in os.environ]
+    xla.prefer_cpu()
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # JAX asserts that there is any
-        names = [name for name in OF_DEVICES if name in os.environ]
         values = "".join(f" with {name}={os.environ[name]}" for name in names)
         reason = in_one_line(error).partition(" (")[0] if str(error) else "there is none like that"
         remedy = f"unset {' and '.join(names)}, or set" if names else "set"

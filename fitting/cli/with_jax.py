@@ -21,8 +21,10 @@ def examine(*, quick: bool) -> Iterator[Finding]:
         return
     import jax
 
-    devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    yield Finding("devices", ", ".join(devices))
+    devices = ", ".join(f"{device.platform}: {device.device_kind}" for device in jax.devices())
+    others = ", ".join(xla.accelerators()) if jax.default_backend() == "cpu" else ""
+    unused = f"; {others} is not used: commands compute on the CPU unless JAX_PLATFORMS is set"
+    yield Finding("devices", f"{devices}{unused if others else ''}")
     yield Finding("XLA flags", xla.describe_flags())
     yield _cached_programs()
     if not quick:

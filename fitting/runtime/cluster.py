@@ -200,6 +200,7 @@ def _prepare() -> None:
     """Has a worker compute as this process does; nothing of JAX has run there before."""
     os.environ.pop(TRIMMED, None)
     xla.configure_xla()
+    xla.prefer_cpu()
     xla.ignore_debugging()
     cache_folder.use_default()
 

@@ -7,6 +7,7 @@ from importlib import metadata
 
 VARIABLE = "XLA_FLAGS"
 ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
+PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # either says where JAX computes
 
 # What each flag gains was measured with JAX 0.10.2; in brackets, by CPU time with 0.12.0.1.
 
@@ -75,6 +76,24 @@ def configure_xla() -> None:
     keep_freed_memory()
     if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
+
+
+def prefer_cpu() -> None:
+    """Has JAX compute on the CPU, unless a variable of the environment names a platform.
+
+    Call it before JAX computes anything. A clip is a loop of small steps, and fits are loops of
+    clips: a GPU spends its time starting kernels. Processes that this one starts do likewise.
+    """
+    import jax
+
+    if not any(name in os.environ for name in PLATFORMS):
+        os.environ[PLATFORMS[0]] = "cpu"
+        jax.config.update(PLATFORMS[0].lower(), "cpu")
+
+
+def accelerators() -> list[str]:
+    """The names of JAX's plugins for accelerators that are installed here, as `xla_cuda13`."""
+    return sorted({plugin.name for plugin in metadata.entry_points(group="jax_plugins")})
 
 
 def ignore_debugging() -> None:

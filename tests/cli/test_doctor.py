@@ -12,10 +12,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from fitting.cli import examination, main, self_test, status
+from fitting.cli import examination, main, self_test, status, with_jax
 from fitting.cli.examination import Finding, from_json
 from fitting.experiment import problems
-from fitting.runtime import machine
+from fitting.runtime import machine, xla
 from support import quick
 from support.experiments import ROOT
 
@@ -46,6 +46,17 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
     assert done.returncode == status.PROBLEMS_FOUND
     assert "rich cannot be imported: not here" in done.stdout
     assert "jax cannot be imported: no AVX" in done.stdout and "processor" in done.stdout
+
+
+def test_an_accelerator_that_commands_leave_alone_is_named(monkeypatch):
+    for installed, said in (
+        ([], "cpu: cpu"),
+        (["xla_cuda13"], "xla_cuda13 is not used: commands "),
+    ):
+        monkeypatch.setattr(xla, "accelerators", lambda installed=installed: installed)
+        findings = {finding.subject: finding for finding in with_jax.examine(quick=True)}
+        fact = findings["devices"].fact
+        assert said in fact and ("not used" in fact) == bool(installed)
 
 
 def test_a_flag_that_ends_the_process_is_a_line_with_a_remedy(tmp_path, monkeypatch, capsys):

@@ -161,6 +161,21 @@ def test_a_variable_that_jax_does_not_start_with_is_a_line_with_a_remedy(name, v
     assert said in line and line.count("\n") == 1 and f"unset {name}" in line
 
 
+def test_commands_compute_on_the_cpu_unless_a_variable_says_where(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(jax.config, "update", lambda *pair: chosen.append(pair))
+    for name in xla.PLATFORMS:
+        for other in xla.PLATFORMS:
+            monkeypatch.setenv(other, "cuda")
+            monkeypatch.delenv(other)
+        monkeypatch.setenv(name, "cuda")
+        xla.prefer_cpu()
+        assert not chosen and [os.environ.get(other) for other in xla.PLATFORMS].count(None) == 1
+    monkeypatch.delenv(name)
+    xla.prefer_cpu()
+    assert chosen == [("jax_platforms", "cpu")] and os.environ["JAX_PLATFORMS"] == "cpu"
+
+
 def test_a_platform_that_is_not_here_is_refused_where_jax_only_asserts_that_it_is(monkeypatch):
     monkeypatch.setattr(jax, "devices", Mock(side_effect=AssertionError))
     for values, said in (
