@@ -25,6 +25,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -248,7 +249,10 @@ def evaluate(
 
     def call(filled: Array) -> tuple[Array, ...]:
         cost, residuals = _evaluate(problem, filled)
-        return (cost,) if slopes is None else (cost, residuals @ slopes.matrix)
+        if slopes is None:
+            return (cost,)
+        # In full precision: a GPU would round to fewer bits.
+        return cost, jnp.matmul(residuals, slopes.matrix, precision=jax.lax.Precision.HIGHEST)
 
     cost, *gradients = _of_batches(call, candidates)
     finite = np.isfinite(cost)
