@@ -27,8 +27,9 @@ PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAYS = 2.0  # of a sole, that other ground has to support more than that to which a foot swings
 SOONEST, LATEST = 0.06, 0.2  # s, in which a foot slides to what holds it better
-SPREAD = 0.4  # of the way that is left: how far from a predicted foothold the foot may land
-PLACES = np.array([0.0, -1.0, -0.5, 0.5, 1.0])  # on the way, in parts of that
+# By how much more of itself the predicted way that is left turns out to be longer: the median of 69
+# swings of two people on uneven ground, and about the quantiles of 10, 30, 70 and 90 %.
+PLACES = np.array([0.15, -0.3, 0.0, 0.4, 0.8])
 
 
 class StrideProbe(AbstractSupportedProbe):
@@ -230,7 +231,7 @@ class StrideProbe(AbstractSupportedProbe):
         ball = inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
         way = vec.reject(stride.next_ws - ball, level.up_ws)
         assert isinstance(stride, foresight.PlannedStride) and stride.sure is not None
-        parts = jnp.asarray(PLACES, way.dtype)[:, None] * SPREAD * (1.0 - stride.sure)
+        parts = jnp.asarray(PLACES, way.dtype)[:, None] * (1.0 - stride.sure)
         places_ws = stride.next_ws + vec.scale(way, parts)
         grounds = jax.vmap(
             lambda next_ws: self._ground_of(
