@@ -63,6 +63,7 @@ NUMBERS = "contribution.json"
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
 
+JOINTS = "pelvis, knees and ankles"
 MARGIN = 5e-5  # m: what tables of cm with two digits round to 0
 
 PANELS_PER_ROW = 4
@@ -431,7 +432,7 @@ def _rise(key: str, rise: float) -> str:
 
 
 class Rise(NamedTuple):
-    """How much further ankles are from the captured ones without a rule, on held-out parts."""
+    """How much further joints are from the captured ones without a rule, on held-out parts."""
 
     variant: str
     mean: float
@@ -466,7 +467,7 @@ def document(experiment: Experiment, rows: Sequence[Row]) -> Document:
 
 def rises(rows: Sequence[Row]) -> list[Rise]:
     """The rise of each variant whose rise is known, the largest first."""
-    held_out = {(row.variant, row.part): row.agreement.ankle for row in rows if row.part}
+    held_out = {(row.variant, row.part): _distance(row) for row in rows if row.part}
     parts = sorted({part for _, part in held_out})
     findings = []
     for variant in dict.fromkeys(row.variant for row in rows if row.variant != COMPLETE):
@@ -482,16 +483,22 @@ def findings(rows: Sequence[Row]) -> list[Finding]:
     return [_soundness(rows), *_rules(rises(rows))]
 
 
+def _distance(row: Row) -> float:
+    """Of pelvis, knees and ankles from the captured ones, m, rms over the three."""
+    of = row.agreement
+    return math.sqrt((of.pelvis**2 + of.knee**2 + of.ankle**2) / 3.0)
+
+
 def _parts(rows: Sequence[Row]) -> int:
     return max(row.part for row in rows)
 
 
 def _soundness(rows: Sequence[Row]) -> Finding:
     complete = [row for row in rows if row.variant == COMPLETE]
-    held_out = [row.agreement.ankle for row in complete if row.part]
-    seen = next(row.agreement.ankle for row in complete if not row.part)
+    held_out = [_distance(row) for row in complete if row.part]
+    seen = next(_distance(row) for row in complete if not row.part)
     distance = (
-        f"with all rules the ankles are {100 * sum(held_out) / len(held_out):.2f} cm from the "
+        f"with all rules {JOINTS} are {100 * sum(held_out) / len(held_out):.2f} cm from the "
         f"captured ones (rms) on parts that were held out, {100 * seen:.2f} cm where everything "
         "was fitted"
     )
@@ -513,14 +520,14 @@ def _rules(rises: Sequence[Rise]) -> list[Finding]:
     size = f"{100 * first.mean:.2f} cm"
     if first.mean <= MARGIN:
         most = Finding(
-            "No rule is needed: without any one of them, ankles of held-out parts are no further "
-            "from the captured ones.",
+            f"No rule is needed: without any one of them, {JOINTS} of held-out parts are no "
+            "further from the captured ones.",
             bad=True,
         )
     else:
         where = "in every part" if first.everywhere else "on average, though not in every part"
         most = Finding(
-            f"Without `{first.variant}` the ankles of held-out parts are {size} further off, the "
+            f"Without `{first.variant}` {JOINTS} of held-out parts are {size} further off, the "
             f"most of all, {where}."
         )
     idle = [f"`{rise.variant}`" for rise in rises if rise.mean <= MARGIN]
@@ -529,8 +536,8 @@ def _rules(rises: Sequence[Rise]) -> list[Finding]:
             most,
             Finding(
                 f"{listed(idle)} {'earns' if len(idle) == 1 else 'earn'} nothing here: without "
-                f"{'it' if len(idle) == 1 else 'any of them'} held-out ankles are as close, or "
-                f"closer by up to {max(0.0, -100 * rises[-1].mean):.2f} cm.",
+                f"{'it' if len(idle) == 1 else 'any of them'} {JOINTS} of held-out parts are as "
+                f"close, or closer by up to {max(0.0, -100 * rises[-1].mean):.2f} cm.",
                 bad=True,
             ),
         ]

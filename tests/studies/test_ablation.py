@@ -241,7 +241,8 @@ SEARCH: SearchRecord = {
 
 
 def row(variant: str, part: int, **figures: float) -> Row:
-    all_figures = dict.fromkeys(ACCURACY, 0.02) | figures
+    joints = dict.fromkeys(("pelvis", "knee"), figures.get("ankle", 0.02))
+    all_figures = dict.fromkeys(ACCURACY, 0.02) | joints | figures
     values = {"pelvis.on_gain": 0.3} | ({} if variant == PITCH else {"foot.max_pitch": 0.4})
     return Row(
         "key", variant, part, Accuracy(**all_figures), values, {**SEARCH, "converged": part != 2}
@@ -296,13 +297,25 @@ def test_summary_and_page_show_groups_ablations_and_fits_that_did_not_converge(t
 
 def test_the_page_says_what_a_rule_is_worth_where_it_was_not_fitted():
     for first, second, sentence, bad in (
-        (0.041, 0.035, "Without `pitch` the ankles of held-out parts are 0.70 cm further", False),
+        (
+            0.041,
+            0.035,
+            "Without `pitch` pelvis, knees and ankles of held-out parts are 0.70",
+            False,
+        ),
         (0.041, 0.029, "0.40 cm further off, the most of all, on average, though not", False),
         (0.025, 0.031, "No rule is needed: without any one", True),
     ):
         held_out = [row(PITCH, 1, ankle=first), row(PITCH, 2, ankle=second)]
         _, rule, _ = ablation.findings([*ROWS[:3], *held_out, row(PITCH, 0)])
         assert sentence in rule.text and rule.bad is bad
+
+
+def test_a_rule_that_moves_the_pelvis_alone_earns_something():
+    held_out = [row(PITCH, part, ankle=0.03, pelvis=0.05) for part in (1, 2)]
+    whole = [row(ALL, part, ankle=0.03, pelvis=0.02) for part in (0, 1, 2)]
+    _, rule, _ = ablation.findings([*whole, *held_out, row(PITCH, 0)])
+    assert "held-out parts are 1.08 cm further off, the most of all, in every part" in rule.text
 
 
 def test_the_figure_has_a_bar_per_variant_and_a_point_per_part():
