@@ -411,8 +411,9 @@ def in_chunks(
 ) -> Callable[[], list[PyTree]]:
     """A call that computes a crowd on its ground in chunks, as many at a time as there are cores.
 
-    All chunks use one program, of a crowd, a ground and one member: its workspace, times the cores,
-    is what a crowd of any size needs.
+    A GPU computes all members at once: 64 at a time are 30 times slower there. All chunks use one
+    program, of a crowd, a ground and one member: its workspace, times the cores, is what a crowd of
+    any size needs.
     """
 
     def of_chunk(shared: tuple[Crowd, Terrain], members: Member) -> PyTree:
@@ -420,7 +421,7 @@ def in_chunks(
 
     members = crowd.members
     shared = dataclasses.replace(crowd, members=jax.tree.map(lambda leaf: leaf[:0], members))
-    size = min(chunk, crowd.members.first.size)
+    size = min(cpu_block(chunk) or members.first.size, members.first.size)
     return measurement.compile_parts(name, of_chunk, (shared, ground), members, size, sparse=ground)
 
 
