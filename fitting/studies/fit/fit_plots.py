@@ -26,7 +26,7 @@ from fitting.report.style import AFTER, BEFORE, CAPTURED, LOCKED, SLIDING, STAGE
 RISE = 1e-6  # relative, of the lowest cost: more than rounding
 LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
 MOMENTS, APART = 6, 0.7  # at most, and s between them
-MINOR = 0.3  # of the largest difference, below which a moment is not shown
+MINOR = 0.5  # of the largest difference, below which a moment is not shown
 FRAMED = 0.75, 1.25  # m, how far ahead and how high a moment is seen, of legs of `FRAMED_LEGS`
 FRAMED_LEGS = 0.9  # m
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
@@ -108,7 +108,7 @@ def moments(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     names = ["pelvis", *(f"{leg} {joint}" for leg in legs for joint in ("knee", "ankle"))]
     size = _leg_length(playback.captured) / FRAMED_LEGS
     title = f"{title}, seen from the right"
-    figure, panels = style.panels(len(chosen), 3, title, 5.2, 1.4)
+    figure, panels = style.panels(len(chosen), min(3, len(chosen)), title, 5.2, 1.4)
     for axes, frame in zip(panels, chosen, strict=True):
         across = playback.travelled[frame]
         pelvis = float(playback.height(playback.captured.pelvis[frame]))
