@@ -18,8 +18,8 @@ from reference.maths import Transform
 from support.cases import QUICK, stacked
 from support.clips import make_rig, to_frames, to_rig
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "mec", "stride")]
-PRESETS = ["record", "unreal", *SLOW]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "unreal", "mec", "stride")]
+PRESETS = ["record", *SLOW]
 WALKS = 0.6  # m/s
 HAND = 1  # number of this limb
 SHOULDER, HEIGHT, AHEAD = 1.45, 1.2, 0.45  # m, of the hand over the floor, and ahead of the body
