@@ -52,7 +52,8 @@ gc.set_threshold(200_000, 50, 100)
 
 MAX_KEPT = 1e9  # bytes of programs, of old sources most of them
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
-MAX_RESIDENT = 2.5e9  # bytes of one test process after a file
+MAX_RESIDENT = 2.5e9  # bytes of one test process after a file,
+MAX_SHARE = 1 / 6  # or this part of the machine's memory, where that is more
 LONGEST = ("test_notebooks.py", "test_documents.py")
 PEAKS: list[int] = []  # bytes of memory of each test process
 
@@ -97,8 +98,9 @@ def bounded_memory() -> Iterator[None]:
     mappings, sizes = Path("/proc/self/maps"), Path("/proc/self/statm")  # on Linux only
     if not mappings.exists():
         return
-    resident = int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
-    if resident > MAX_RESIDENT or mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
+    resident, physical = int(sizes.read_text().split()[1]), os.sysconf("SC_PHYS_PAGES")  # pages
+    most = max(MAX_RESIDENT / os.sysconf("SC_PAGESIZE"), MAX_SHARE * physical)
+    if resident > most or mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
         jax.clear_caches()
         gc.collect()
         with contextlib.suppress(AttributeError):  # of the GNU C library, which keeps what is freed
