@@ -183,7 +183,13 @@ class LegBatch(eqx.Module):
     def lanes(self) -> tuple:
         """Everything but the system, with the legs on the last axis, for `jaxik.lanes`."""
         parts = (self.rig, self.frame, self.sensed, self.target_ms)
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], parts)
+        return _legs_last(parts)
+
+
+@jax.jit  # one program instead of one for each shape
+def _legs_last(tree: Tree) -> Tree:
+    """Leaves (legs, ...) as (1, ..., legs)."""
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], tree)
 
 
 @jax.jit
@@ -209,6 +215,7 @@ def leg_batch(legs: int) -> LegBatch:
     return jax.block_until_ready(LegBatch(ik, *_by_leg((rigs, motion, sensed, target))))
 
 
+@jax.jit
 def _by_leg(tree: Tree) -> Tree:
     """Leaves (frames, 2 legs, ...) and (frames, ...) as (legs, ...)."""
 
