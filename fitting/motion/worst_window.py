@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from fitting.problem.scene import PER_LEG
 
-from .playback import Playback
+from .playback import Playback, Series
 
 SECONDS = 2.0
 POSITIONS = ("ankle", "knee", "pelvis")  # kinds that are a distance in the world
@@ -83,8 +83,8 @@ def find_worst_window(playback: Playback) -> WorstWindow:
     kinds = sorted(totals, key=lambda kind: -totals[kind])
     per_leg = [squares[kind][inside].sum(axis=0) for kind in kinds if kind in PER_LEG]
     legs = np.broadcast_to(sum(per_leg, np.zeros(())), playback.stance.shape[1:])
-    sizes = _sizes(playback, kinds[0])[inside]
-    offset_frame, column = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
+    of_worst = sizes(playback, kinds[0], playback.seen)[inside]
+    offset_frame, column = np.unravel_index(int(np.argmax(of_worst)), of_worst.shape)
     frame, leg = start + int(offset_frame), int(column) if kinds[0] in PER_LEG else None
     seen_inside = np.zeros_like(seen)
     seen_inside[inside] = seen[inside]
@@ -100,7 +100,7 @@ def find_worst_window(playback: Playback) -> WorstWindow:
         leg_fractions=legs / max(float(legs.sum()), 1e-300),
         frame=frame,
         leg=leg,
-        size=float(sizes[offset_frame, column]),
+        size=float(of_worst[offset_frame, column]),
         offset=_offset(playback, kinds[0], frame, leg),
         out_of_reach=float(np.mean(np.asarray(playback.reached)[inside] < 0.5)),
         pelvis=float(pelvis[seen_inside].mean()) if seen_inside.any() else np.nan,
@@ -148,11 +148,16 @@ def _squares(playback: Playback, kind: str) -> Float[np.ndarray, "frames columns
     return _by_frame(squares, kind).sum(axis=-1)
 
 
-def _sizes(playback: Playback, kind: str) -> Float[np.ndarray, "frames columns"]:
-    """Length of the error of a kind, in the unit of its sigma; 0 where it does not count."""
+def sizes(
+    playback: Playback, kind: str, frames: Bool[Series, " frames"]
+) -> Float[np.ndarray, "frames columns"]:
+    """Length of the error of a kind, in the unit of its sigma; 0 where it does not count.
+
+    A column for each leg, or one for the body. Of the frames only these count.
+    """
     errors = np.abs(np.asarray(playback.errors[kind], np.float64))
-    counts = playback.counts(kind, playback.seen)
-    return np.linalg.norm(_by_frame(errors, kind), axis=-1) * counts
+    lengths = np.linalg.norm(_by_frame(errors, kind), axis=-1)
+    return np.where(playback.counts(kind, frames), lengths, 0.0)
 
 
 def window_sums(series: Float[np.ndarray, " frames"], length: int) -> Float[np.ndarray, " windows"]:

@@ -210,6 +210,18 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
         assert 1000 < picture.width < 2000 and 1000 < picture.height < 2500
 
 
+def test_the_moments_that_differ_most_are_shown_of_clips_that_are_held_out_too():
+    errors = error("ankle", slice(118, 121), 0.0, 0.06, 0.08, leg=0)
+    errors |= error("pelvis", 200, 0.0, 0.09, 0.0) | error("knee", 250, 0.0, 0.03, 0.0, leg=1)
+    unseen = np.zeros(FRAMES, bool)
+    for play in (playback(errors), playback(errors, seen=unseen, held_out=~unseen)):
+        figure = fit_plots.moments(play, LEGS, "hill: where it differs most")
+        titles = [axes.get_title(loc="left") for axes in figure.axes]
+        assert titles == ["3.93 s: left ankle 10.0 cm off", "6.67 s: pelvis 9.0 cm off"]
+        *_, ankles = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 4][:-1]
+        assert ankles.get_ydata()[2] == pytest.approx(play.after.ankle[118, 0, 1])
+
+
 def test_normal_residuals_are_drawn_beside_the_density_of_the_normal_distribution():
     knees = {"knee": np.random.default_rng(1).normal(0.0, 0.03, (FRAMES, 2, 3))}
     _, _, _, axes, *_ = fit_plots.noise(playback(knees), "are the residuals noise?").axes

@@ -1,7 +1,7 @@
 """Pictures of a fit; each function draws one figure."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from fitting.inference.profiles.profile import Profile
 from fitting.motion import goodness
 from fitting.motion.goodness import autocorrelations, scale_by_median
 from fitting.motion.playback import Motion, Playback
-from fitting.motion.worst_window import WorstWindow
-from fitting.problem.scene import MEASURED
+from fitting.motion.worst_window import POSITIONS, WorstWindow, sizes
+from fitting.problem.scene import MEASURED, PER_LEG
 from fitting.problem.space import FreeParameter, from_fractions, to_fractions
 from fitting.report import style
 from fitting.report.formatting import RESIDUALS
@@ -27,8 +27,7 @@ RISE = 1e-6  # relative, of the lowest cost: more than rounding
 LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
 MOMENTS, APART = 6, 0.7  # at most, and s between them
 MINOR = 0.5  # of the largest difference, below which a moment is not shown
-FRAMED = 0.75, 1.25  # m, how far ahead and how high a moment is seen, of legs of `FRAMED_LEGS`
-FRAMED_LEGS = 0.9  # m
+AHEAD, BELOW, ABOVE = 0.85, 1.4, 0.3  # leg lengths around the pelvis, of what a moment shows
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
 
 SECONDS = 1.0  # of lag, that are shown
@@ -103,54 +102,51 @@ def side_view(playback: Playback, legs: Sequence[str], title: str) -> Figure:
 @style.styled
 def moments(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """The moments in which solved and captured body differ most, each from the side."""
-    distances = _distances(playback)
-    chosen = _worst_moments(np.nansum(distances, axis=1), playback.time)
-    names = ["pelvis", *(f"{leg} {joint}" for leg in legs for joint in ("knee", "ankle"))]
-    size = _leg_length(playback.captured) / FRAMED_LEGS
+    known = np.asarray(playback.seen) | np.asarray(playback.held_out)
+    distances = np.hstack([sizes(playback, kind, known) for kind in POSITIONS])
+    of_legs = ([f"{leg} {kind}" for leg in legs] for kind in POSITIONS if kind in PER_LEG)
+    names = [*chain.from_iterable(of_legs), "pelvis"]
+    chosen = _worst_moments(distances.sum(axis=1), playback.time)
     title = f"{title}, seen from the right"
     figure, panels = style.panels(len(chosen), min(3, len(chosen)), title, 5.2, 1.4)
+    size, pelvis = _leg_length(playback.captured), playback.height(playback.captured.pelvis)
     for axes, frame in zip(panels, chosen, strict=True):
-        across = playback.travelled[frame]
-        pelvis = float(playback.height(playback.captured.pelvis[frame]))
-        axes.set_xlim(across - FRAMED[0] * size, across + FRAMED[0] * size)
-        axes.set_ylim(pelvis - FRAMED[1] * size, pelvis + 0.25 * size)
+        across, worst = playback.travelled[frame], int(np.argmax(distances[frame]))
+        axes.set_xlim(across - AHEAD * size, across + AHEAD * size)
+        axes.set_ylim(pelvis[frame] - BELOW * size, pelvis[frame] + ABOVE * size)
         axes.set_aspect("equal")
-        ground = np.asarray(playback.ground_ws)
-        for leg in range(len(legs)):
-            along = playback.along(ground)[:, leg]
-            order = np.argsort(along, kind="stable")
-            style.earth(axes, along[order], playback.ground_height()[order, leg])
-        for colour, motion in _motions(playback):
-            width = 3.0 if colour == BEFORE else 6.0
-            joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)
-            for points in (joints[:, leg] for leg in range(len(legs))):
-                line = playback.along(points)[frame], playback.height(points)[frame]
-                axes.plot(*line, color=colour, linewidth=width, solid_capstyle="round", alpha=0.75)
-            middle = playback.along(motion.pelvis)[frame], playback.height(motion.pelvis)[frame]
-            axes.plot(*middle, "o", color=colour, markersize=2.5 * width, alpha=0.75)
-        worst = int(np.nanargmax(distances[frame]))
         off = 100 * distances[frame, worst]
         axes.set_title(f"{playback.time[frame]:.2f} s: {names[worst]} {off:.1f} cm off")
+    along, ground = playback.along(playback.ground_ws), playback.ground_height()
+    for leg in range(len(legs)):
+        order = np.argsort(along[:, leg], kind="stable")
+        for axes in panels:
+            style.earth(axes, along[order, leg], ground[order, leg])
+    for colour, motion in _motions(playback):
+        width = 3.0 if colour == BEFORE else 6.0
+        joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)
+        for points, line in ((joints, "-"), (np.asarray(motion.pelvis)[:, None, None], "o")):
+            across, height = playback.along(points), playback.height(points)
+            for axes, frame in zip(panels, chosen, strict=True):
+                axes.plot(
+                    across[frame].T,
+                    height[frame].T,
+                    line,
+                    color=colour,
+                    linewidth=width,
+                    markersize=2.5 * width,
+                    solid_capstyle="round",
+                    alpha=0.75,
+                )
     style.legend(figure, *_lines(playback), style.ground_key("ground under a foot's track"))
     return figure
 
 
-def _distances(playback: Playback) -> Float[np.ndarray, "frames joints"]:
-    """m, between solved and captured pelvis, knees and ankles, leg by leg; NaN where not seen."""
-    after, captured = playback.after, playback.captured
-    legs = np.stack([after.knee - captured.knee, after.ankle - captured.ankle], axis=2)
-    pelvis = np.asarray(after.pelvis - captured.pelvis)[:, None]
-    errors = np.concatenate([pelvis, legs.reshape(len(pelvis), -1, 3)], axis=1)
-    counts = np.repeat(playback.counts("knee", playback.seen), 2, axis=1)
-    counts = np.concatenate([np.asarray(playback.seen)[:, None], counts], axis=1)
-    return np.where(counts, np.linalg.norm(errors, axis=-1), np.nan)
-
-
-def _worst_moments(sizes: Float[np.ndarray, " frames"], time: np.ndarray) -> list[int]:
-    """Frames of the largest of these sizes, in their order, each some time from the others."""
+def _worst_moments(off: Float[np.ndarray, " frames"], time: np.ndarray) -> list[int]:
+    """Frames in which it is furthest off, in their order, each some time from the others."""
     chosen: list[int] = []
-    for frame in np.argsort(-sizes, kind="stable"):
-        if len(chosen) == MOMENTS or sizes[frame] < MINOR * np.max(sizes):
+    for frame in np.argsort(-off, kind="stable"):
+        if len(chosen) == MOMENTS or off[frame] < MINOR * np.max(off):
             break
         if all(abs(time[frame] - time[other]) >= APART for other in chosen):
             chosen.append(int(frame))
@@ -158,10 +154,9 @@ def _worst_moments(sizes: Float[np.ndarray, " frames"], time: np.ndarray) -> lis
 
 
 def _leg_length(motion: Motion) -> float:
-    """m, of thigh and shin in the first frame."""
+    """m, of thigh and shin; the median of all legs and frames."""
     thigh, shin = motion.knee - motion.hip, motion.ankle - motion.knee
-    lengths = np.linalg.norm(thigh, axis=-1) + np.linalg.norm(shin, axis=-1)
-    return float(np.median(lengths))
+    return float(np.median(np.linalg.norm(thigh, axis=-1) + np.linalg.norm(shin, axis=-1)))
 
 
 @style.styled
