@@ -588,7 +588,7 @@ CAUSES = {
     "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
     "limit": "the system refuses the ground: {3} is {4}, and feet stand on it with {5}",
-    "off": "the system leaves {0:.0%} of these feet as animated, as `unreal` does while the "
+    "off": "the system leaves {1:.0f} % of these feet as animated, as `unreal` does while the "
     "character moves",
     "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
 }
