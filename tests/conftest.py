@@ -34,8 +34,8 @@ PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 KEPT_PROGRAMS = ROOT / ".pytest_cache" / "programs"  # `--cache-clear` empties it
 os.environ.setdefault(PROGRAMS, str(KEPT_PROGRAMS))
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
-SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
-jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
+SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept
+jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0.1")))
 cache_folder.write_complete_files()  # what one process writes another may read
 
 # Some tests send themselves what Ctrl-C does, which shells have jobs in the background ignore.
@@ -74,7 +74,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Tells the process that started this one how much memory it took."""
+    """Tells the process that started this one how much memory it took, and lets pytest end soon."""
+    gc.freeze()  # pytest collects five times as it ends
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     getattr(session.config, "workeroutput", {})["peak"] = peak
     PEAKS.append(peak)

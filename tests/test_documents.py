@@ -120,9 +120,9 @@ PAGE_PARSERS = [
 ]
 
 
-LONG = "jaxik/README.md"  # it differentiates all stages
+LONG = ("jaxik/README.md", "jaxik/stages/README.md")  # these compile whole systems
 CASES = [
-    pytest.param(path, id=name_of(path), marks=[pytest.mark.slow] * (name_of(path) == LONG))
+    pytest.param(path, id=name_of(path), marks=[pytest.mark.slow] * (name_of(path) in LONG))
     for path in PAGES
 ]
 

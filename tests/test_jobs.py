@@ -303,6 +303,7 @@ print(json.dumps([fitted.solution.u.tolist(), posterior.u.tolist(), fitted.summa
 """
 
 
+@pytest.mark.slow
 def test_a_process_with_32_bits_gets_the_numbers_of_64_keeps_its_setting_and_writes_nothing(
     done, tmp_path
 ):
@@ -353,6 +354,7 @@ def animation(tmp_path) -> fitting.AnimationFiles:
     return fitting.AnimationFiles(tmp_path / "short.npz", ground)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::fitting.studies.animations.PlacementWarning")
 def test_systems_made_in_32_bits_are_compared_in_64(animation):
     with jax.enable_x64(False):

@@ -11,17 +11,12 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 NAMES = [path.stem for path in NOTEBOOKS]
 FITS = {"3_fit_and_posterior"}
-LONG = {*FITS, "2_stage_by_stage", "4_a_crowd", "5_other_systems", "6_a_rule_of_your_own"}
 # What only makes a notebook's pictures fuller: the same cells run with less of it.
 SMALLER = {
     "3_fit_and_posterior": {"end=5.0,  # s": "end=2.0,  # s"},
     "4_a_crowd": {"COUNT = 10_000": "COUNT = 1_000"},
     "6_a_rule_of_your_own": {"end=5.0,  # s": "end=2.0,  # s"},
 }
-CASES = [
-    pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
-    for path in NOTEBOOKS
-]
 CELL_TIMEOUT = 600  # s; on two idle cores a whole notebook takes less than a minute
 
 
@@ -43,8 +38,9 @@ def test_notebooks_are_stored_without_outputs():
             assert "execution" not in cell.metadata, (path, cell.source)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of nbclient; a notebook's own warnings are on stderr
-@pytest.mark.parametrize("path", CASES)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
 def test_a_notebook_runs_without_errors_or_warnings(path):
     notebook = nbformat.read(path, as_version=4)
     for full, smaller in SMALLER.get(path.stem, {}).items():

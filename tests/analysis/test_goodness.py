@@ -150,6 +150,7 @@ def test_only_tolerances_count_without_noise():
 # The numbers
 
 
+@pytest.mark.slow
 def test_p_values_are_uniform_where_the_noise_is_as_assumed():
     for rho, given in ((0.0, 0.0), (RHO, RHO), (RHO, 0.0)):
         plays = [whiten(simulate(seed, rho=rho), given) for seed in range(150)]

@@ -181,6 +181,7 @@ def test_every_phrase_is_checked():
     assert {name for cases in CASES.values() for name in cases} == {*AT_LIMITS, *EVENTS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "name"), [(system, name) for system, cases in CASES.items() for name in cases]
 )
@@ -197,6 +198,7 @@ def test_motion_that_is_said_to_be_missing_determines_the_parameter(system, name
     assert low <= present_value(ik, name) <= high
 
 
+@pytest.mark.slow
 def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
     """A step up 1.5 m ahead; the rises are those of the loss, with the tails of the fit."""
     clip, ground, tails = "walks", "step 0.25", 2.0

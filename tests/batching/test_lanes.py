@@ -165,6 +165,7 @@ def test_the_results_are_those_of_vmap():
         assert_same(result, expected)
 
 
+@pytest.mark.slow
 def test_the_derivatives_are_those_of_vmap():
     expected, result = derivatives(numbers(BATCH, 3), numbers(BATCH, 3, seed=1))
     assert_same(result, expected, 1e-10)

@@ -32,6 +32,7 @@ def mapped_by_jax(monkeypatch):
     return names
 
 
+@pytest.mark.slow
 def test_the_pipeline_has_rules_for_its_primitives_in_the_installed_jax(mapped_by_jax):
     problem = workloads.problem(16, workloads.parameter_names(20))
     jax.make_jaxpr(problem.residuals_and_jacobian)(problem.space.start)

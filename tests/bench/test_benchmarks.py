@@ -318,6 +318,7 @@ def test_import_times_do_not_include_that_of_jax(monkeypatch):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs, monkeypatch):
     monkeypatch.setattr(machine, "vector_bits", lambda: 256)
     timings = measure("legs")
@@ -333,6 +334,7 @@ def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs,
         assert np.ptp(our_rot[:, 0]) > 1e-3  # the legs differ
 
 
+@pytest.mark.slow
 def test_exported_systems_have_their_time_their_size_and_their_targets(monkeypatch):
     monkeypatch.setattr(toolchain, "FLAGS", ("-O0",))
     if toolchain.compiler() is None:

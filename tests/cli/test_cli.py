@@ -290,6 +290,7 @@ def on_hill(tmp_path_factory) -> list:
     return ["run", folder / "walk.npz", "--terrain", folder / "hill.ply", "-o"]
 
 
+@pytest.mark.slow
 def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_path, capsys):
     run(*on_hill, tmp_path / "out.npz", "--preset", "record")  # compiles sooner than `stride`
     output = capsys.readouterr()

@@ -31,6 +31,7 @@ def doctor(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]
     return done
 
 
+@pytest.mark.slow
 def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
     done = doctor(tmp_path)
     assert done.returncode == 0, done.stdout

@@ -25,6 +25,7 @@ def parameters(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_trace_of_a_clip_is_replayed_by_a_program_in_c(tmp_path, parameters, capsys):
     folder, clip = tmp_path / "code", load_clip(BASE)
     save_clip(tmp_path / "walk.npz", clip.select(slice(0, 5)))

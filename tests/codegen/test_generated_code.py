@@ -156,6 +156,7 @@ def test_generated_javascript_gives_the_answers_of_jaxik_step(tmp_path, walk, hi
     assert largest_difference(rays, expected.rays) < CLOSE
 
 
+@pytest.mark.slow
 def test_a_crowd_in_lanes_gives_the_answers_of_jaxik_run(walk, hills, unreal, monkeypatch):
     """Characters that begin with the clip, or where it restarts, beside others that differ."""
     compiler("c")

@@ -289,6 +289,7 @@ def test_a_swing_that_is_cut_off_begins_where_the_whole_clip_shows_it(walk):
         assert contacts.cut_off_swing(balls_ws[frames], stance[frames], LEG) is None
 
 
+@pytest.mark.slow
 def test_a_swing_that_the_end_cuts_off_goes_on_as_in_the_whole_clip(walk):
     leaving, landing = swing_of(walk)
     whole = clip_frames.frames_from_clip(walk).stride

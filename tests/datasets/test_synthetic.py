@@ -333,6 +333,7 @@ def test_the_climber_moves_one_limb_at_a_time_and_goes_straight_up_the_wall():
     assert np.linalg.norm(np.diff(clip.positions_ws, axis=0), axis=-1).max() * FPS < 2.0
 
 
+@pytest.mark.slow
 def test_on_a_wall_the_root_lies_on_it_and_foot_ik_moves_four_limbs_over_it(tmp_path):
     clip = multi_limb.climb(1.0, 30.0)
     frames = clip_frames.frames_from_clip(clip, up_ws=WALL_UP)

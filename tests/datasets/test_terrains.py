@@ -339,6 +339,7 @@ def test_stances_are_at_the_balls_with_the_ground_a_sole_below_even_if_a_marker_
         reconstruction.reconstruct(replace(clip, positions_ws=positions))
 
 
+@pytest.mark.slow
 def test_the_memory_for_stances_grows_with_their_number_and_not_its_square():
     clip = edit.resample(stair_walk(slope, strides=6), 10.0)
     repeats = 100
@@ -420,6 +421,7 @@ def test_cells_lie_between_their_corners_and_quarter_turns_have_one_canonical_fo
         np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
 
 
+@pytest.mark.slow
 def test_an_unknown_grid_is_found(monkeypatch):
     monkeypatch.setattr(reconstruction, "PITCHES", (0.35, 0.7))
     monkeypatch.setattr(reconstruction, "COARSE_BEST", 4)

@@ -167,10 +167,10 @@ BLOCKS, CLIMB = (1141,), (120, 107, 126, 128)  # frames of each clip: 38 s, and 
     ("name", "lengths"),
     [
         ("blocks", BLOCKS),
-        ("blocks_walk", BLOCKS),
-        ("blocks_causal", BLOCKS),
+        pytest.param("blocks_walk", BLOCKS, marks=pytest.mark.slow),
+        pytest.param("blocks_causal", BLOCKS, marks=pytest.mark.slow),
         ("climb", CLIMB),
-        ("two_grounds", (622, 520, *CLIMB)),
+        pytest.param("two_grounds", (622, 520, *CLIMB), marks=pytest.mark.slow),
     ],
 )
 def test_the_experiments_on_captured_ground_make_a_problem(mocap, name, lengths):

@@ -49,6 +49,7 @@ def sample(problem: Problem, start: WalkerStart, **settings) -> Posterior:
     return posterior.sample_posterior(problem, start, SamplerSettings(**settings))
 
 
+@pytest.mark.slow
 def test_modes_get_their_exact_weights_from_unbalanced_starts():
     settings = {"walkers": 24, "max_steps": 2000, "stop_at": 1e9}
     sampled = sample(two_modes(6, (0.2, 0.8)), start_of(6, 0), **settings)

@@ -326,6 +326,7 @@ def test_a_weight_does_not_move_the_best_fit(correlated, no_pipeline):
         assert solution.cost == fits[0][1].cost
 
 
+@pytest.mark.slow
 def test_intervals_contain_the_truth_under_correlated_noise_of_another_size(
     correlated, no_pipeline
 ):

@@ -176,6 +176,7 @@ def bumps(limit: float = 1.2) -> Assessed:
     return assessed(Bumps, truth, 1)
 
 
+@pytest.mark.slow
 def test_profiles_are_the_same_on_another_number_of_cores(monkeypatch):
     problem, solution, before = bumps()
     cores = 3 if threads.usable_cores() == 1 else 1

@@ -86,6 +86,7 @@ def run(surveyed, tmp_path, monkeypatch):
     return Run(Workplace(root, tmp_path / "copy"), Survey(root, folder), tmp_path / "1.jsonl")
 
 
+@pytest.mark.slow
 def test_only_what_runs_is_mutated(surveyed):
     changes = [diff(mutant, surveyed[0]) for mutant in mutants_of(surveyed[0], MODULE)]
     assert sorted(changes) == [
@@ -97,6 +98,7 @@ def test_only_what_runs_is_mutated(surveyed):
     ]
 
 
+@pytest.mark.slow
 def test_those_are_asked_that_execute_the_line_and_pass_quick_files_first(surveyed):
     """Files that changed since the survey are asked before them, whole."""
     root, folder = surveyed

@@ -95,6 +95,7 @@ def centres(result: jaxik.Result) -> np.ndarray:
     return np.asarray(result.trace.advanced.state.centre_ws)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "sails"), PRESETS)
 def test_a_walk_far_away_is_the_walk_at_the_origin(preset: str, sails: bool):
     expected = compiled(*far_walk(preset, 0.0, sails))
@@ -111,6 +112,7 @@ def test_a_walk_far_away_is_the_walk_at_the_origin(preset: str, sails: bool):
             assert_close(getattr(result, part), getattr(expected, part), tolerance)
 
 
+@pytest.mark.slow
 def test_a_trace_is_in_world_space_and_memory_about_its_centre():
     trace, near = (compiled(*far_walk("record", away)).trace for away in (1e3, 0.0))
     by, rounding = offset(1e3), 4 * float(np.spacing(np.float32(1e3)))

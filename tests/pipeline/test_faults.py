@@ -93,9 +93,12 @@ class Played(NamedTuple):
         return at(self, number)
 
 
-@pytest.fixture(scope="module", params=["mec", pytest.param("record", marks=pytest.mark.slow)])
+MOST = [pytest.param(name, marks=pytest.mark.slow) for name in ("mec", "record")]
+
+
+@pytest.fixture(scope="module", params=["unreal", *MOST])
 def played(request: pytest.FixtureRequest) -> Played:
-    """By the two presets that remember most."""
+    """By the preset that compiles soonest, and by those that remember most."""
     ik = getattr(jaxik.presets, request.param)()
 
     @functools.partial(jax.jit, compiler_options=QUICK)

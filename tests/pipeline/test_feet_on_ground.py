@@ -105,6 +105,7 @@ def on_the_floor(values: dict[str, Any], frames: list) -> Feet:
     return jax.device_get(with_feet(to_ik(values, "record as it comes"), to_frames(frames)))
 
 
+@pytest.mark.slow
 def test_feet_stay_under_a_root_that_turns_until_they_point_too_far_away():
     angle, most = np.radians(60.0), 0.5
     frames = animate(RIG, heading=lambda time: angle * np.clip(time - 1.0, 0.0, 1.0))
@@ -121,6 +122,7 @@ def test_feet_stay_under_a_root_that_turns_until_they_point_too_far_away():
     assert (angle - end < most).all() and (end > start + most).all()
 
 
+@pytest.mark.slow
 def test_the_heel_rises_about_a_held_ball():
     """While the root, and so the whole foot, drifts."""
     frames = animate(RIG, place=lambda time: [0.0, 0.0, 0.03 * time])

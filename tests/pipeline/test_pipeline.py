@@ -235,8 +235,8 @@ def test_the_defaults_are_those_of_the_reference(name):
         np.testing.assert_allclose(actual, expected[key], rtol=1e-6, err_msg=key)
 
 
-# A rule of contacts that "record as it comes" has, too, in a program of its own.
-AT_LENGTH = ("mec as it comes",)
+# Programs of their own for rules of contacts; `stride` has the better part of them.
+AT_LENGTH = ("mec as it comes", "record as it comes")
 NAMES = [
     pytest.param(name, how, marks=pytest.mark.slow if name in AT_LENGTH else ())
     for name, each in CASES.items()

@@ -446,6 +446,7 @@ def test_only_the_smooth_program_contains_a_sigmoid():
     assert not {"logistic", "tanh", "erf"} & hard and "logistic" in smooth
 
 
+@pytest.mark.slow
 def test_single_precision_is_within_a_hundredth_of_a_millimetre_and_one_program_has_all_values():
     program = hard_program().lower().compile()
     for name in PARAMETERS:

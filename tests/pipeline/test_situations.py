@@ -18,10 +18,10 @@ from support.cases import QUICK
 from support.clips import to_frames, to_rig
 
 FRAMES, HZ = 120, 60.0
-OZZ, RECORD, STRIDE = (
-    pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "record", "stride")
+OZZ, MEC, RECORD, STRIDE = (
+    pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "mec", "record", "stride")
 )
-GAMES = (OZZ, "unreal", "mec")  # with roots of their own
+GAMES = (OZZ, "unreal", MEC)  # with roots of their own
 TOES = standing()[0, 2] + 0.12  # m, ahead of the root
 APART = 20.0  # m, from the middle of one place to that of the next
 
@@ -86,6 +86,7 @@ def test_nobody_climbs_onto_a_roof_or_the_bench_on_which_it_sits(preset: str, pl
     assert ankles(result)[..., 1].max() < ANKLE + 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw, push", [(1.0, 0.0), (0.0, 0.2)])
 def test_mec_lets_go_of_a_foot_that_its_body_leaves(yaw: float, push: float):
     frames = standing_clip(
@@ -101,6 +102,7 @@ def test_mec_lets_go_of_a_foot_that_its_body_leaves(yaw: float, push: float):
     assert np.linalg.norm(np.diff(places, axis=0), axis=-1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_leg_of_mec_reaches_into_a_dip():
     lowered = ankles(run("mec", standing_clip("dip")))[-1, :, 1] - ANKLE
     np.testing.assert_allclose(sorted(lowered), [-0.2, 0.0], atol=0.01)
@@ -113,7 +115,7 @@ def test_unreal_takes_a_captured_idle_for_standing():
     np.testing.assert_allclose(sorted(raised), [0.0, 0.12], atol=0.01)
 
 
-@pytest.mark.parametrize("preset", [RECORD, "mec"])
+@pytest.mark.parametrize("preset", [RECORD, MEC])
 def test_a_foot_whose_toes_are_over_a_ledge_stays_level(preset: str):
     frames = standing_clip("ledge")
     result = run(preset, frames)
@@ -130,7 +132,7 @@ def test_four_legs_lie_along_a_slope_and_two_do_not(preset: str):
         assert (rate == along) if along else rate < 0
 
 
-@pytest.mark.parametrize("preset", [RECORD, STRIDE, "mec"])
+@pytest.mark.parametrize("preset", [RECORD, STRIDE, MEC])
 def test_a_squatter_with_a_foot_on_a_block_puts_it_on_top(preset: str):
     """The legs fold hardly more than animated, so the body rises with the block."""
     squat = standing_clip(

@@ -218,6 +218,7 @@ def test_the_ends_of_a_clip_that_may_be_shifted_do_not_count(tmp_path):
     assert list(np.flatnonzero(~observed[1])) == [0, 1, 2, 3, 27, 28, 29, 30]
 
 
+@pytest.mark.slow
 def test_errors_are_those_from_what_the_capture_would_show(tmp_path):
     """At the numbers that displaced a reference nothing is left; without them, they are."""
     rest = "[capture]\nground_height = {}\nankle_up = {}\nscale = {}"

@@ -132,6 +132,7 @@ def each(different: Problem) -> list[Problem]:
     return [dataclasses.replace(different, data=(scene,)) for scene in scenes]
 
 
+@pytest.mark.slow
 def test_a_clip_more_needs_no_loop_and_hardly_an_operation_more(different, each):
     """So compiling takes hardly longer."""
 
@@ -149,6 +150,7 @@ def test_a_clip_more_needs_no_loop_and_hardly_an_operation_more(different, each)
     assert three.total() < 1.5 * one.total()
 
 
+@pytest.mark.slow
 def test_residuals_and_places_of_clips_in_a_row_are_those_of_clips_alone(different, each):
     """Whatever the system remembers, tracks, sizes, sigmas and bodies included."""
     together, places = evaluation(committed(different))

@@ -165,6 +165,7 @@ def test_frames_unobserved_kinds_switched_off_and_legs_absent_have_no_residuals(
         assert first.any() and not second.any(), kind
 
 
+@pytest.mark.slow
 def test_a_leg_that_is_left_out_has_no_residuals_and_affects_no_other(problem, start):
     """Where it comes back, its residuals are as in a first frame."""
     (scene,) = problem.data
@@ -255,6 +256,7 @@ def measured(problem) -> Problem:
     return changed(problem, {"smooth": np.inf, "correlation": 0.0}, {"observed": observed})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("correlation", "fraction"), [(0.0, 1.0), (0.9, 1.0), (0.0, 0.1)])
 def test_residuals_at_the_truth_are_the_noise_that_is_assumed(measured, correlation, fraction):
     """Standard normal, and as correlated as the fraction of independent ones says."""

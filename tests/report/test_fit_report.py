@@ -274,6 +274,7 @@ def test_the_second_of_two_clips_has_its_own_plots(fitted, twice, tmp_path, undr
     assert captions["worst_2.png"] == "hill, clip 2: the worst 1.9 seconds"
 
 
+@pytest.mark.slow
 def test_a_playback_has_the_residuals_of_the_fit_and_rebuilds_captured_joints(fitted):
     (scene,), (played,) = fitted.problem.data, fitted.playbacks
     assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
@@ -625,6 +626,7 @@ def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):
 # The capture
 
 
+@pytest.mark.slow
 def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_system(fitted):
     shown = replace(fitted)
     rows = fitted.summary["parameters"]

@@ -158,6 +158,7 @@ print(json.dumps([kept.tolist(), program_key(make_problem, ((problem,), {}))]))
 """
 
 
+@pytest.mark.slow
 def test_another_process_has_the_same_keys_and_its_programs_are_not_traced_again(
     folder, tmp_path, monkeypatch
 ):

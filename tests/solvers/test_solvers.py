@@ -180,6 +180,7 @@ SINGULAR = {
 
 # Ozz's angle between the normals has a kink where a hinge begins to tilt in a plane that needs no
 # rotation, or one by pi: gradients are compared away from there, and only have to be finite there.
+@pytest.mark.slow
 def test_gradients_of_a_bend_match_finite_differences():
     hinge, to_hip, to_ankle, target, pole, across = RNG.normal(size=(6, ROWS, 3))
     hinge = unit(hinge)
@@ -310,6 +311,7 @@ SINGULAR_AIMS = {
 }
 
 
+@pytest.mark.slow
 def test_gradients_of_aims_match_finite_differences():
     target, forward, offset, up, pole = RNG.normal(size=(5, ROWS, 3))
     target = RNG.uniform(0.7, 2.0, (ROWS, 1)) * unit(target)

@@ -94,6 +94,7 @@ def jumped() -> jaxik.Result:
     return jax.jit(jax.vmap(run), compiler_options=QUICK)(by_contact, *jumps())
 
 
+@pytest.mark.slow
 def test_no_joint_moves_faster_whatever_weight_jumps():
     """Once everything has settled."""
     pose = at(jumped().pose, (slice(CASES), slice(OFF - 2, None)))
@@ -102,6 +103,7 @@ def test_no_joint_moves_faster_whatever_weight_jumps():
         assert 0.002 < moved <= LIMIT, name
 
 
+@pytest.mark.slow
 def test_a_character_in_the_air_is_as_animated_after_its_fade():
     result, frames = jumped(), jumps()[1]
     assert np.abs(np.asarray(result.pose.ankle.pos - frames.pose.ankle.pos)).max() > 0.05
@@ -231,6 +233,7 @@ def test_a_leg_that_is_missing_for_a_frame_is_forgotten_at_once():
     assert lag.max() < LIMIT + speed and lag[110:].max() < 1e-6
 
 
+@pytest.mark.slow
 def test_gradients_of_the_fade_are_finite_where_nothing_has_to_be_corrected():
     ground, trace = walked()
     sensed, offset_ws = trace.sensed, trace.advanced.state.pelvis.offset_ws

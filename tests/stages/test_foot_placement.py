@@ -85,6 +85,7 @@ def test_a_leg_whose_target_is_out_of_reach_stretches_to_it_and_no_further():
     np.testing.assert_array_equal(rigid[0][:2], knee[:2])
 
 
+@pytest.mark.slow
 def test_a_stretched_leg_has_right_and_finite_derivatives():
     def of_leg(values, target, blurred):
         rule = TwoBone(max_knee_angle=np.pi, allow_stretch=True, **values)
@@ -200,6 +201,7 @@ def test_toes_stay_on_the_ground_under_a_raised_heel_on_slopes_and_steps():
     np.testing.assert_array_equal(bend(rule, *arrays, 0.0)[1], np.eye(4)[[0] * LEGS])
 
 
+@pytest.mark.slow
 def test_bent_toes_have_right_and_finite_derivatives_in_both_precisions():
     def of_feet(values, ground, blurred):
         return bent(KeepFoot(**values), *ground, gate=Either(blurred > 0.5))[0]

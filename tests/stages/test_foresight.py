@@ -76,6 +76,7 @@ def resumed(
     return Clip(ik, inputs, state, None, {}).ahead("probe", watch, contacts, None)
 
 
+@pytest.mark.slow
 def test_nothing_changes_on_a_flat_floor():
     result = run(frames_of(), to_terrain(level_blocks((-3.0, 3.0, 0.0))))
     effector, sensed = result.trace.advanced.effector, result.trace.sensed
@@ -83,6 +84,7 @@ def test_nothing_changes_on_a_flat_floor():
     assert np.abs(result.body.pos).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_no_later_frame_is_read():
     """Whatever follows frame 70: another walk, at another speed, with other labels."""
     seen = 70
@@ -174,6 +176,7 @@ def next_footholds(times: jax.Array, velocity_ws: jax.Array, still: jax.Array) -
     return foreseen(ik, frames)[1].next_ws[::4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", [True, False])
 def test_strides_have_equal_and_finite_derivatives_in_forward_and_reverse_mode(moves):
     velocity_ws = moves * frames_of().velocity_ws[20:60:2]

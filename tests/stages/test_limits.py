@@ -38,7 +38,7 @@ PROBES = {
     "CornerProbe": jaxik.presets.mec,
     "StrideProbe": lambda: with_option(jaxik.presets.stride(), "probe.slide_to_support", False),
 }
-REST = [pytest.param(name, marks=pytest.mark.slow) for name in list(PROBES)[1:]]
+FIRST = ["FootProbe", *(pytest.param(x, marks=pytest.mark.slow) for x in list(PROBES)[1:])]
 FRAME = animate(RIG, count=1)[0]
 FLOOR = (-3.0, 3.0, -0.02)  # a level block
 UP_START = 1.2  # m above the root, where rays start
@@ -252,14 +252,14 @@ def on_blocks(ik: jaxik.FootIK, *blocks: tuple[float, ...]) -> GroundHits:
     return at(jax.device_get(ground_under(ik, to_terrain(level_blocks(*blocks)), raised())), 0)
 
 
-@pytest.mark.parametrize("preset", ["FootProbe", *REST])
+@pytest.mark.parametrize("preset", FIRST)
 def test_a_foot_stands_on_the_floor_under_a_table(preset):
     hits = on_blocks(system(preset, check_support=True), (-3.0, 3.0, 0.5), FLOOR)
     np.testing.assert_allclose(hits.ankle.point[:, 1], -0.02, rtol=0, atol=1e-12)
     assert (hits.ankle.found == 1).all()
 
 
-@pytest.mark.parametrize("preset", PROBES)
+@pytest.mark.parametrize("preset", FIRST)
 def test_a_step_fades_out_as_it_becomes_too_high_or_too_low(preset):
     """The foothold leaves the ground without a jump, and is the animated one in the end."""
     found = on_steps(system(preset, check_support=True)).ankle.found
@@ -271,6 +271,7 @@ def test_a_step_fades_out_as_it_becomes_too_high_or_too_low(preset):
         assert np.abs(np.diff(part, axis=0)).max() < 1.5 * STEP / 0.1 + 1e-9
 
 
+@pytest.mark.slow
 def test_a_toe_on_half_accepted_ground_is_between_it_and_the_level_of_the_foot():
     """The rule of Mec looks for its toe from where it puts the sole."""
     ik = system("CornerProbe", check_support=True)
@@ -284,7 +285,7 @@ def test_a_toe_on_half_accepted_ground_is_between_it_and_the_level_of_the_foot()
     np.testing.assert_allclose(toes, ((1 - weight) * sole)[half], rtol=1e-9)
 
 
-@pytest.mark.parametrize("preset", PROBES)
+@pytest.mark.parametrize("preset", FIRST)
 def test_no_foot_stands_on_a_post_but_on_the_floor_below(preset):
     ik = system(preset, check_support=True)
     below = np.concatenate([on_blocks(ik, FLOOR).ankle.point, FRAME.toe.pos])

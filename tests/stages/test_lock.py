@@ -49,6 +49,7 @@ def tracks(result: jaxik.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     return tuple(map(np.asarray, tracks))  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 def test_nothing_jumps_at_lock_or_release():
     targets, footholds, unlocked, locked = tracks(slipping())
     offset = np.linalg.norm(targets - unlocked, axis=-1)

@@ -210,6 +210,7 @@ def last_height(half_life: jax.Array, max_speed: jax.Array, speed: jax.Array) ->
     return heights(RAMP, moving, GroundRoot(half_life=half_life, max_speed=max_speed))[-1:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "numbers", [(0.2, 4.0, 1.0), (0.2, 4.0, 0.0), (0.0, 4.0, 1.0), (0.2, 0.5, 1.0)]
 )

@@ -237,6 +237,7 @@ def test_a_foot_tilts_no_further_than_its_joint_and_stays_where_that_is_beyond_a
     np.testing.assert_allclose(limited, [0.2, -0.2, 0.3, -0.6, 0.0, 0.0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_foot_in_the_middle_rolls_onto_the_ground_as_far_as_the_others():
     frames, slope = to_frames(animate(RIG, count=1)), to_terrain(planes((0.0, 0.1, 0.0)))
 

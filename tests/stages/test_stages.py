@@ -239,20 +239,19 @@ def test_all_numbers_switches_and_masks_have_a_case(name: str):
     assert {case.leaf for case in CASES[name]} == expected
 
 
-@pytest.mark.parametrize("name", ["record", STRIDE, "by speed"])
-def test_each_leaf_has_the_expected_effect(name: str):
-    if name != "record":  # whose derivatives are quick
-        by_value = cases.outcomes_of(CASES[name], cases.system(name), sloped=False)
-        assert not by_value.without_effect()
-    else:
-        assert not outcomes(name).without_effect()
-
-
 @pytest.mark.parametrize("name", ["record", STRIDE, SPEED])
+def test_each_leaf_has_the_expected_effect(name: str):
+    by_value = cases.outcomes_of(CASES[name], cases.system(name), sloped=False)
+    assert not by_value.without_effect()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_the_derivative_of_each_number_is_its_difference_quotient(name: str):
     assert not outcomes(name).with_wrong_slope()
 
 
-@pytest.mark.parametrize("name", ["record", SPEED])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["record", "by speed"])
 def test_values_and_derivatives_are_finite_where_formulas_are_singular(name: str):
     singular.assert_sound(name, limps=name == "record")

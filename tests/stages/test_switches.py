@@ -175,8 +175,6 @@ CASES: dict[str, tuple[Case, ...]] = {
         STANDING,
     ),
 }
-# What the reference says of these two, in `tests/pipeline`, covers the same numbers.
-LARGEST = [pytest.param(name, marks=pytest.mark.slow) for name in ("ozz", "mec")]
 # In `test_own_rules`, `test_limits`, `test_foot_placement` and `tests/pipeline/test_situations.py`.
 IN_OWN_TESTS = ("warp.", "probe.min_support", "probe.support_radius", "lock.release_")
 IN_OWN_TESTS += ("leg.max_stretch", "foot.toe_length", "foot.max_toe_", "probe.flight_layers")
@@ -191,7 +189,8 @@ def test_all_numbers_switches_and_masks_of_a_system_have_a_case(preset: str):
     assert {case.leaf for case in CASES[preset]} == leaves
 
 
-@pytest.mark.parametrize("preset", ["unreal", *LARGEST])
+@pytest.mark.slow  # the references in `tests/pipeline` have the same numbers
+@pytest.mark.parametrize("preset", CASES)
 def test_each_leaf_has_the_expected_effect_or_none(preset: str):
     by_value = cases.outcomes_of(CASES[preset], cases.system(preset), sloped=False)
     assert not by_value.without_effect()

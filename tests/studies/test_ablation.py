@@ -192,6 +192,7 @@ def test_without_a_folder_nothing_is_written_and_progress_says_what_is_fitted(
 # What is not fitted again
 
 
+@pytest.mark.slow
 def test_only_changed_variants_are_fitted_again(tmp_path, search, monkeypatch):
     out, new, clearings = tmp_path / "out", [], []
     monkeypatch.setattr(ablation.jax, "clear_caches", lambda: clearings.append(len(new)))

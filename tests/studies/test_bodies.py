@@ -85,6 +85,7 @@ def test_feet_stand_as_long_as_an_adults_whatever_the_body(source, request):
             assert contact_share(other, preset) == pytest.approx(share, abs=0.02), (preset, name)
 
 
+@pytest.mark.slow
 def test_with_ozz_soles_are_on_a_flat_floor_untouched(walk):
     run = jax.jit(jaxik.run)
     for name, make in BODIES.items():

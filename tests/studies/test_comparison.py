@@ -287,6 +287,7 @@ def test_a_rate_of_which_the_clips_is_no_multiple_is_refused(fast):
             measure({"ozz": preset_system("ozz")}, fast, [fps])
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(Animation, "solve", raised_by_frame_time)
     monkeypatch.setattr(Animation, "reached", lambda *_: np.ones((360, 2)))

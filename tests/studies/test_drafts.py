@@ -108,6 +108,7 @@ def test_the_command_says_what_it_assumes(drafted):
     assert "free: 1 of 62 parameters" in text and "now: jaxik fit" in text
 
 
+@pytest.mark.slow
 def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(draft, "choose_free", choose_few)
     clip = first_seconds(WALK)

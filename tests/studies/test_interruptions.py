@@ -184,6 +184,7 @@ def test_a_killed_fit_goes_on_after_its_search_and_after_the_last_stage_of_its_p
     assert (killed / parameters).read_text() == (whole / parameters).read_text()
 
 
+@pytest.mark.slow
 def test_the_search_of_another_experiment_is_not_used(killed, experiment_file, monkeypatch):
     monkeypatch.setattr(assess, "assess_identifiability", kill)
     other = experiment_file.with_name("other.toml")

@@ -251,6 +251,7 @@ def run_alone(ik: jaxik.FootIK, scene: Scene) -> Playback:
     return playback.play(scene, playback.run(ik, scene))
 
 
+@pytest.mark.slow
 def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
     batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
     with jax.enable_x64(False):  # as it is for users

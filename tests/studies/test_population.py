@@ -224,6 +224,7 @@ def test_the_folder_has_a_report_and_parameters(made):
         assert preset.name == "record"
 
 
+@pytest.mark.slow
 def test_what_has_not_converged_is_said_and_ends_with_status_3(
     tmp_path, monkeypatch, undrawn, capsys
 ):

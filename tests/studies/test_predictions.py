@@ -87,6 +87,7 @@ def surprises(problem: Problem, **noise) -> dict[str, list[str]]:
 # Predictive checks
 
 
+@pytest.mark.slow
 def test_a_capture_with_the_assumed_noise_is_like_its_replicates(replayed):
     assert [check.kind for check in replayed.checks] == list(KINDS)
     assert [check.surprises for check in replayed.checks] == [[]] * len(KINDS)
@@ -97,6 +98,7 @@ def test_a_capture_with_the_assumed_noise_is_like_its_replicates(replayed):
     )
 
 
+@pytest.mark.slow
 def test_other_noise_is_found_out_kind_by_kind(problem):
     sigmas = noise_of(problem).sigmas
     of_kinds = surprises(problem, sigmas={**sigmas, "knee": 3 * sigmas["knee"]})
@@ -105,6 +107,7 @@ def test_other_noise_is_found_out_kind_by_kind(problem):
     assert all("autocorrelation" in names for names in correlated.values())
 
 
+@pytest.mark.slow
 def test_an_outlier_is_found_out(problem):
     knees = problem.data[0].reference.knee_ws.at[10, 0, 1].add(0.2)
     spoilt = eqx.tree_at(lambda p: p.data[0].reference.knee_ws, problem, knees)

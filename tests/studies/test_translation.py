@@ -195,6 +195,7 @@ def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():
     assert table[4][-1] == "–"
 
 
+@pytest.mark.slow
 def test_only_parameters_that_move_the_clip_are_free_by_default(run):
     (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
     named = sensitivity.all_parameters(presets.record())

@@ -339,6 +339,7 @@ def labelled(tmp_path_factory) -> Iterator[tuple[Server, Path]]:
         yield server, folder
 
 
+@pytest.mark.slow
 def test_stances_put_right_on_the_page_are_read_wherever_the_clip_is(labelled):
     server, folder = labelled
     names = "uneven_walk.npz", "uneven_walk_base.npz"

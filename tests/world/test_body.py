@@ -331,13 +331,8 @@ def test_numbers_of_a_similar_body_change_by_their_units_and_nothing_else_does()
     assert float(slope) == pytest.approx(0.3, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "unreal",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in PRESETS if name != "unreal"),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRESETS)
 def test_two_bodies_of_equal_shape_move_alike(name):
     """The larger one 1.3 times as far in the root of 1.3 times the time."""
     heights = 0.04 * np.random.default_rng(0).normal(size=(40, 40))

@@ -258,6 +258,7 @@ def test_a_mesh_with_moved_vertices_equals_a_mesh_built_there():
     np.testing.assert_allclose(hit.point, [0.0, 1.0, 0.05], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_batches_over_terrains_masks_and_rays_equal_single_casts():
     vertices, triangles = rough(6)
     mesh = terrain.mesh(vertices, triangles, layer=np.arange(len(triangles)) % 3)
@@ -339,6 +340,7 @@ def bumps(seed: int, shape: tuple[int, int] = (5, 5), layer: int = 0) -> terrain
     return terrain.mesh(*lattice(heights, 0.25), layer=layer)
 
 
+@pytest.mark.slow
 def test_rays_meet_each_of_several_merged_terrains_of_any_shape_where_it_was_put():
     raised = bumps(2, (7, 6), layer=3).moved(jnp.array([0.0, 1.0, 0.0]))
     grounds = bumps(1), raised, terrain.combine(bumps(3), bumps(4, (5, 9)))
