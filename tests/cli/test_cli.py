@@ -305,6 +305,7 @@ def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(on_hill, tmp_p
     assert load_clip(tmp_path / "out.npz").positions_ws[..., 1].max() > 2.5
 
 
+@pytest.mark.slow
 def test_apply_says_how_far_it_puts_a_clip_that_follows_its_ground_from_the_captured_one(
     on_hill, tmp_path, capsys
 ):

@@ -82,6 +82,7 @@ def with_joints(clip, joints):
     return clip
 
 
+@pytest.mark.slow
 def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(clip, result):
     solved = clip_frames.clip_from_result(clip, result)
     joints = solved.positions_ws[:, np.array(clip.rig.joints)]

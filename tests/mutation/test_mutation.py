@@ -124,6 +124,7 @@ def test_a_change_of_a_statement_is_one_of_all_its_lines(tmp_path):
     assert [list(statement(path, line)) for line in (2, 5, 7)] == [[1, 2, 3], [4, 5, 6], [7]]
 
 
+@pytest.mark.slow
 def test_a_run_tells_caught_mutants_from_survivors_and_keeps_what_it_found(run):
     root, seen = run.workplace.root, []
     wanted = ("return 2.0 / x", "return 1.0 * x")

@@ -29,11 +29,9 @@ FPS = 30.0
 FURTHEST = 1e5  # m
 BORDER = np.array([0.0, 0.0, 0.5 * LATTICE - 1.0])
 HILL = grounds.hill()
-PRESETS = [  # and whether the hill is a ship; `ozz` and `unreal` have no memory that these have not
-    ("record", False),
-    pytest.param("mec", True, marks=pytest.mark.slow),
-    pytest.param("stride", False, marks=pytest.mark.slow),
-]
+# And whether the hill is a ship; `ozz` and `unreal` have no memory that these have not.
+PRESETS = [("record", False), ("mec", True), ("stride", False)]
+pytestmark = pytest.mark.slow
 
 compiled = jax.jit(jaxik.run, compiler_options=QUICK)
 
@@ -95,7 +93,6 @@ def centres(result: jaxik.Result) -> np.ndarray:
     return np.asarray(result.trace.advanced.state.centre_ws)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "sails"), PRESETS)
 def test_a_walk_far_away_is_the_walk_at_the_origin(preset: str, sails: bool):
     expected = compiled(*far_walk(preset, 0.0, sails))
@@ -112,7 +109,6 @@ def test_a_walk_far_away_is_the_walk_at_the_origin(preset: str, sails: bool):
             assert_close(getattr(result, part), getattr(expected, part), tolerance)
 
 
-@pytest.mark.slow
 def test_a_trace_is_in_world_space_and_memory_about_its_centre():
     trace, near = (compiled(*far_walk("record", away)).trace for away in (1e3, 0.0))
     by, rounding = offset(1e3), 4 * float(np.spacing(np.float32(1e3)))
@@ -156,7 +152,6 @@ def test_the_centre_stays_in_a_bad_frame_and_moves_in_the_next():
     assert_close(result.pose, expected.pose, EXACT)
 
 
-@pytest.mark.slow
 def test_steps_far_away_are_the_run():
     ik, rig, ground, clip = far_walk("record", FURTHEST)
     result, step = compiled(ik, rig, ground, clip), jax.jit(jaxik.step, compiler_options=QUICK)

@@ -277,6 +277,7 @@ def test_residuals_at_the_truth_are_the_noise_that_is_assumed(measured, correlat
             assert stats.kstest(series.ravel(), "norm").pvalue > 1e-4, kind
 
 
+@pytest.mark.slow
 def test_seeds_give_noise_but_for_kinds_that_are_off_and_accelerations_have_none(problem, measured):
     u = np.zeros(2)
     first, again, other = (simulate(measured, u, seed) for seed in (3, 3, 4))

@@ -112,6 +112,7 @@ def test_a_character_in_the_air_is_as_animated_after_its_fade():
         assert np.abs(moved[0:CASES:4, ON - 1]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_feet_land_at_the_speed_of_the_fall():
     result, fall = at((jumped(), jumps()[1]), CASES)
     feet = np.asarray(fall.world_from_model.pos[:, None] + result.pose.ankle.pos)

@@ -100,6 +100,7 @@ def test_no_later_frame_is_read():
     assert later.max() > 0.05
 
 
+@pytest.mark.slow
 def test_labelled_footholds_are_not_read():
     frames = frames_of()
     places = 0.0 * frames.stride.last_ws
