@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 import jaxik
 from fitting.clips import clip_frames, load_clip, save_clip
 from fitting.clips.clip import Clip
-from fitting.codegen.trace import with_restart
+from fitting.codegen.export import with_restart
 from fitting.experiment.problems import ClipData, make_scene
 from fitting.ground import meshes
 from fitting.problem.problem import Problem

@@ -22,7 +22,6 @@ from fitting.codegen import (
     c_code,
     c_files,
     crowd,
-    crowd_program,
     cs_code,
     cs_files,
     export,
@@ -448,7 +447,7 @@ def test_every_operation_gives_the_answers_of_jax_in_lanes(
     if lanes is not None:  # narrower vectors than this processor's
         monkeypatch.setattr(crowd, "LANES", dict.fromkeys(crowd.LANES, lanes))
     rows, expected = operands
-    built = crowd_program.of_program(operations, [])
+    built = crowd.of_program(operations, [])
     frames = jax.tree.map(lambda leaf: leaf[:, None], rows)
     trees, axes = (operations.ik, walk[0], terrain.plane(), frames), (None, None, None, 0)
     kernel = crowd.compiled(built)
