@@ -24,7 +24,7 @@ from .studies.exports import export_code as export_code
 from .studies.fit.fit_jobs import fit as fit
 from .studies.many.fit_many import fit_many as fit_many
 from .studies.population import population as population
-from .studies.sample.run_comparison import compare_runs as compare_runs
+from .studies.sample.sample_jobs import compare_runs as compare_runs
 from .studies.sample.sample_jobs import sample as sample
 from .studies.suite import run_suite as run_suite
 from .studies.terrain_report import reconstruct_terrain as reconstruct_terrain

@@ -15,8 +15,8 @@ from fitting.report import motion_data, pages
 from fitting.studies import comparison
 from fitting.studies.fit import fit_motions
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import run_comparison
-from fitting.studies.sample.run_comparison import ComparedRun
+from fitting.studies.sample import sample_jobs
+from fitting.studies.sample.sample_jobs import ComparedRun
 from jaxik.maths import parameter_tree
 from support import comparisons, runs
 from support.browsers import launch, needs_chromium
@@ -66,7 +66,7 @@ def comparison_path(tmp_path_factory) -> Path:
 def plain_path(tmp_path_factory) -> Path:
     """A page without a view."""
     folder = tmp_path_factory.mktemp("plain")
-    run_comparison.document(RUNS).write(folder)
+    sample_jobs.document(RUNS).write(folder)
     return folder / pages.PAGE
 
 

@@ -27,8 +27,8 @@ from fitting.report.style import save
 from fitting.studies import animations, comparison
 from fitting.studies.fit import fit_motions, fit_plots, fit_report, fit_tables
 from fitting.studies.fit.fit import Fit
-from fitting.studies.sample import run_comparison
-from fitting.studies.sample.run_comparison import ComparedRun
+from fitting.studies.sample import sample_jobs
+from fitting.studies.sample.sample_jobs import ComparedRun
 from support import comparisons, runs
 from support.comparisons import DEEP
 from support.experiments import ROOT
@@ -536,6 +536,6 @@ def test_runs_that_cannot_be_told_apart_are_said_so():
     ):
         other = ComparedRun("b", -10.0 - behind, 2.0, behind, 1.0, 4.0, unreliable, {1: -9.0})
         runs = [ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}), other]
-        findings = run_comparison.findings(runs)
+        findings = sample_jobs.findings(runs)
         found = [finding.bad for finding in findings if finding.text.startswith(first)]
         assert len(findings) == 3 and found == [bad], first

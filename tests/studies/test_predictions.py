@@ -29,8 +29,7 @@ from fitting.studies.fit import run_folder
 from fitting.studies.sample import posterior_report
 from fitting.studies.sample import replay as sample_replay
 from fitting.studies.sample.replay import Replay, replay
-from fitting.studies.sample.run_comparison import compare_posteriors
-from fitting.studies.sample.sample_jobs import summarise_replay
+from fitting.studies.sample.sample_jobs import compare_posteriors, summarise_replay
 from support.commands import refusal
 from support.experiments import write
 from support.pages import Page
