@@ -48,9 +48,8 @@ from fitting.report.document import (
 from fitting.report.formatting import Table, listed, meanings, number, transposed
 from fitting.report.style import AFTER, CAPTURED, STAGES
 from fitting.runtime import activity, files
-from fitting.runtime.json_files import Finite, JsonFile, checked
+from fitting.runtime.json_files import Finite, JsonFile, Store, checked
 from fitting.runtime.precision import in_float64
-from fitting.runtime.store import Store
 from fitting.runtime.validation import Content, error_context
 
 from .animations import capture_errors

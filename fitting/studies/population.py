@@ -59,9 +59,8 @@ from fitting.report.document import (
 from fitting.report.formatting import Table, counted, interval, listed, meanings, number
 from fitting.report.style import AFTER, BEFORE, CAPTURED, PRIOR, STAGES
 from fitting.runtime import activity, files
-from fitting.runtime.json_files import Finite, JsonFile
+from fitting.runtime.json_files import Finite, JsonFile, Store
 from fitting.runtime.precision import in_float64
-from fitting.runtime.store import Store
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree
 

@@ -5,8 +5,7 @@ from typing import TypedDict
 
 import pytest
 
-from fitting.runtime.json_files import Finite, JsonFile
-from fitting.runtime.store import Store
+from fitting.runtime.json_files import Finite, JsonFile, Store
 
 
 class Sum(TypedDict):

@@ -23,8 +23,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem, digest_with
 from fitting.runtime import activity, program_cache
 from fitting.runtime.declarations import count
-from fitting.runtime.json_files import Finite, JsonFile, length
-from fitting.runtime.store import Store
+from fitting.runtime.json_files import Finite, JsonFile, Store, length
 from fitting.runtime.validation import Content, in_one_line
 
 from .solution import Elite, Point, Progress, Search, SearchState, Stage, StepsUsedUp

@@ -40,8 +40,7 @@ from fitting.problem.problem import Problem, digest
 from fitting.problem.simulation import simulate
 from fitting.problem.space import FreeParameter, to_fractions
 from fitting.runtime.declarations import count
-from fitting.runtime.json_files import Finite, JsonFile, length
-from fitting.runtime.store import Store
+from fitting.runtime.json_files import Finite, JsonFile, Store, length
 from fitting.runtime.validation import Content
 from fitting.studies.campaign import Campaign
 from fitting.studies.fit.assess import assess_solution, search_with_noise

@@ -40,11 +40,10 @@ from fitting.report.formatting import Table, counted, listed, number, percent
 from fitting.report.style import AFTER, BEFORE, CAPTURED, panels, styled
 from fitting.runtime import activity, cluster, files
 from fitting.runtime.cluster import Effort, Stopwatch, first_alone, waiting_for
-from fitting.runtime.json_files import JsonFile
+from fitting.runtime.json_files import JsonFile, Store
 from fitting.runtime.plain_tree import NotPlainError
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import program_key
-from fitting.runtime.store import Store
 from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
 from fitting.studies.campaign import Campaign, clip_names
