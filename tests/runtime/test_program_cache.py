@@ -349,9 +349,11 @@ def test_a_damaged_program_is_compiled_once_more_and_replaced(tmp_path):
     def compile_anew() -> None:
         assert jax.jit(lambda x: x + 1)(1.0) == 2.0
 
-    before = cache_folder.setting(cache_folder.FOLDER)
+    names = (cache_folder.FOLDER, cache_folder.MIN_SECONDS)
+    before = [cache_folder.setting(name) for name in names]
     cache_folder.write_complete_files()
-    jax.config.update(cache_folder.FOLDER, str(tmp_path))
+    for name, value in zip(names, (str(tmp_path), 0.0), strict=True):
+        jax.config.update(name, value)
     compilation_cache.reset_cache()
     try:
         compile_anew()
@@ -363,6 +365,7 @@ def test_a_damaged_program_is_compiled_once_more_and_replaced(tmp_path):
         assert len(file.read_bytes()) > 50
         compile_anew()  # without a warning
     finally:
-        jax.config.update(cache_folder.FOLDER, before)
+        for name, value in zip(names, before, strict=True):
+            jax.config.update(name, value)
         compilation_cache.reset_cache()
         jax.jit(lambda x: x - 1)(1.0)  # has JAX go back to it at once
