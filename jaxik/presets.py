@@ -76,7 +76,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     if not faithful:
         ik = dataclasses.replace(
             ik,
-            probe=FootProbe(max_step_up=0.33),  # its root may stay on the animation's floor
+            probe=FootProbe(max_step_up=0.45),  # onto boxes, from the animation's floor
             contact=SpeedContact(**STANDING, half_life=0.03),
             target=SlopeTarget(
                 max_ankle_height=1.0,

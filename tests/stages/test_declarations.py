@@ -95,7 +95,7 @@ StrideWarp: min_scale 1 0.4 0 1; max_scale 1 1.5 1 2.5; width 1 1 0 1;
 # with what is other than their defaults.
 PRESETS = """
 record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 half_life=0.03;
-  KeepRoot; StrideWarp; FootProbe max_step_up=0.33;
+  KeepRoot; StrideWarp; FootProbe max_step_up=0.45;
   SlopeTarget max_ankle_height=1 rise_half_life=0.02 fall_half_life=0.02
   spring=yes follow_slopes=yes;
   SlopeLean;
