@@ -565,16 +565,18 @@ class _Search:
         if not _finite(likelihoods):
             raise ValueError("residuals or derivatives are not finite where the mixed model begins")
         model = model_around(likelihoods, self.space, self.grouping, start.mean(axis=0))
-        state = self._at(*self._mode(model, start))
+        state, fraction, way = self._at(*self._mode(model, start)), 1.0, np.zeros(())
         for rounds in range(1, MAX_ROUNDS + 1):
             before, model = model, self._model(state)
             spreads, target = model.most_probable_spreads, self._mode(model, state.likelihoods.u)
-            gap = np.abs(target[0] + target[1] - state.likelihoods.u)[:, self.smooth]
+            away = (target[0] + target[1] - state.likelihoods.u)[:, self.smooth]
+            last, way = way, away / model.estimate(spreads).clip_sd
             change = np.abs(spreads - before.most_probable_spreads) / model.spread_scale
-            near = np.all(gap <= SMALL_STEP * model.estimate(spreads).clip_sd)
-            if near and np.all(change <= SMALL_CHANGE):
+            if np.all(np.abs(way) <= SMALL_STEP) and np.all(change <= SMALL_CHANGE):
                 return self._finished(state, rounds, converged=True)
-            after = self._step(state, target, self._of_all(spreads))
+            if np.sum(way * last) < 0 and np.abs(way).max() > 0.5 * np.abs(last).max():
+                fraction *= 0.5  # steps overshoot, and two points may lead to each other for ever
+            after = self._step(state, target, self._of_all(spreads), fraction)
             if after is state:
                 break
             state = after
@@ -608,15 +610,24 @@ class _Search:
         centre[self.smooth], clips[:, self.smooth] = estimate.centre, estimate.clips
         return centre, clips - centre
 
-    def _step(self, state: _State, target: tuple[np.ndarray, Points], spread: np.ndarray) -> _State:
-        """The state on the way to the target where the cost is no higher, or the state itself."""
+    def _step(
+        self,
+        state: _State,
+        target: tuple[np.ndarray, Points],
+        spread: np.ndarray,
+        longest: float,
+    ) -> _State:
+        """The state on the way to the target where the cost is no higher, or the state itself.
+
+        `longest` is the largest fraction of the way.
+        """
         here = state
         collapsed = np.where(spread > 0, state.deviations, 0.0)
         if np.any(collapsed != state.deviations):  # a spread is 0 now
             here = self._at(state.centre, collapsed)
         cost = self._cost(here, spread)
         for halving in range(HALVINGS):
-            fraction = 0.5**halving
+            fraction = longest * 0.5**halving
             centre = here.centre + fraction * (target[0] - here.centre)
             deviations = here.deviations + fraction * (target[1] - here.deviations)
             trial = self._at(centre, deviations)

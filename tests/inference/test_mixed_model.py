@@ -304,6 +304,21 @@ def test_the_better_of_two_starts_is_kept_and_its_mode_is_the_lowest(space):
     np.testing.assert_allclose(one.spread, other.spread, rtol=0.05)
 
 
+def test_steps_that_overshoot_are_shortened():
+    """Residuals grow as roots of their distances: a step leads almost as far to the other side."""
+
+    def roots(ik: Swing, seen: Array) -> Array:
+        away = (ik.height - seen) / SIGMA
+        return away / (away**2 + 1e-4) ** 0.24
+
+    space = problem_of(Swing(), ("height",), None, roots).space
+    u = np.asarray(space.pack({"height": 0.5}))
+    problems = [Problem(space, jnp.full(100, 0.53), roots) for _ in range(2)]
+    fit = fit_population(problems, Grouping.pooled(2, 1), [np.tile(u, (2, 1))])
+    assert fit.converged and fit.rounds < 30
+    assert float(space.values(jnp.asarray(fit.centre))[0]) == pytest.approx(0.53, abs=1e-3)
+
+
 def test_a_left_out_clip_is_expected_at_the_centre_or_where_its_subject_is(space):
     truth = np.tile(CENTRE, (5, 1))
     truth[:, 1] += [0.5, 0.5, -0.5, -0.5, 0.0]
