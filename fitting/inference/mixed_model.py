@@ -43,6 +43,7 @@ SHARED = -1  # the group of every clip, for a parameter that all clips have in c
 GRID = np.linspace(0.0, 1.0, 401) ** 2  # of the widest spread: where a density is computed
 WIDEST = 4.0  # scales of the half-normal prior, where the grid ends
 MAX_SWEEPS = 200  # over the spreads, each maximised for the others
+ROUNDING = 1e-9  # of a log-density, by which a spread of 0 is no worse than another
 TOLERANCE = 1e-6  # of a spread, relative to its scale, that ends the sweeps
 BLOCK = 200  # draws computed at once
 BURN_IN = 50  # draws of the spreads that are dropped
@@ -262,7 +263,8 @@ class _Conditional(NamedTuple):
             method="bounded",
             options={"xatol": 1e-9 * self.scale},
         )
-        return 0.0 if self.log_density(np.zeros(())) >= -optimum.fun else float(optimum.x)
+        gain = -optimum.fun - float(self.log_density(np.zeros(())))
+        return float(optimum.x) if gain > ROUNDING else 0.0
 
     def density(self) -> SpreadDensity:
         """The distribution on the grid; in each cell, the density is that of its middle."""

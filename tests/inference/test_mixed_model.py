@@ -127,6 +127,9 @@ def test_clips_that_are_alike_have_no_spread():
     alike = measured(1.0 + errors)
     assert alike.most_probable_spreads == 0.0
     np.testing.assert_allclose(alike.estimate(np.zeros(1)).clips, 1.0 + errors.mean(), atol=1e-9)
+    errors *= 0.1 / errors.std(ddof=1)  # just what the noise says: only rounding tells 0 from 1e-5
+    assert measured(errors).most_probable_spreads == 0.0
+    assert measured((1 + 1e-9) * np.array([-1, 0, 1]) / 10).most_probable_spreads == 0.0
 
 
 def test_a_clip_that_says_nothing_takes_the_centre_with_its_spread():
