@@ -41,9 +41,9 @@ BATCH = "batch"  # the axis of the devices
 MEMORY = 1e9  # bytes that chunks take at once, together
 # Bytes of a system on a clip, while it is computed, over those of all that `run` returns for it.
 # Measured of compiled programs, float64, CPU, 8 to 64 at a time: 0.40 of systems on a clip; 0.53 of
-# clips with a system, and 0.27 for the clips themselves. Of clips of one second, 16 at a time, with
-# the ground that they share, 1.21.
-WORKSPACE = 1.5
+# clips with a system, and 0.27 for the clips themselves. The shorter the clips, the more: of half a
+# second, 16 at a time, with all that they share, 2.6.
+WORKSPACE = 3.0
 CACHED = 64  # systems, or clips, at a time on a core of a CPU
 # Legs times frames, of all systems and clips, from which C code pays: it is written anew in each
 # process, in seconds, where JAX's programs are cached, and saves a second in about 16 million.
