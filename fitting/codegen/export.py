@@ -92,7 +92,7 @@ def _struct(pack: Pack, tree: PyTree) -> bytes:
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 TAKEN = ("check", "walk")  # by the programs that come with a trace
-TRACE = "bin"
+TRACE = "trace.bin"
 
 
 class Language(NamedTuple):
