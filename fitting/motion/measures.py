@@ -590,16 +590,18 @@ CAUSES = {
     "limit": "the system refuses the ground: {3} is {4}, and feet stand on it with {5}",
     "off": "the system leaves {1:.0f} % of these feet as animated, as `unreal` does while the "
     "character moves",
+    "late": "rays met the step only once the foot was in it, {1:.0f} cm deep; `stride` looks ahead",
     "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
 }
 
 
 class Cause(NamedTuple):
-    """Why feet are off their ground; `likely_cause` explains the kinds."""
+    """Why feet are off their ground, or pop; `likely_cause` explains the kinds."""
 
     kind: str
     amount: float = 0.0
-    """`offset`: m. `units`: metres for each unit of the terrain. `off`: 0..1, part of the feet."""
+    """`offset`, `late`: m. `units`: metres for each unit of the terrain. `off`: 0..1, of the feet.
+    """
     limit: tuple[str, str, str] = ("", "", "")
     """`limit`: the parameter, its value, and one with which feet stand."""
 
@@ -608,6 +610,11 @@ class Cause(NamedTuple):
         """The cause, and its remedy."""
         side = "high" if self.amount > 0 else "low"
         return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side, *self.limit)
+
+    @property
+    def of(self) -> str:
+        """What it causes."""
+        return "the pop" if self.kind == "late" else "feet off the ground"
 
 
 Trial = Callable[[Cause], Soles | None]
@@ -625,8 +632,8 @@ def likely_cause(
     - `units`: the feet follow the ground by the factor of a unit of length.
     - `offset`: all feet are too high or too low by the same amount.
     - `root`: the higher the ground, the deeper they are in it.
-    - `unknown`: none of these; `limit` and `off`, causes in the system, are for those who know that
-      to find.
+    - `unknown`: none of these; `limit`, `off` and `late`, causes in the system, are for those who
+      know that to find.
 
     Args:
         feet: the soles of the animation.

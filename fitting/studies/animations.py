@@ -49,6 +49,7 @@ from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, quat, vec
+from jaxik.stages.probe import StrideProbe
 from jaxik.stages.probe.limits import AbstractLimitedProbe
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
@@ -58,6 +59,7 @@ from .fit import run_folder
 # Of ground that a probe accepts, and by how much `_binding_limit` raises one until feet stand.
 LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
 RAISED = (1.25, 1.5, 2.0, 3.0)
+BEFORE_POP = 0.1  # s, in which a foot that pops out of a step was in it
 UNMOVED = 1e-3  # m, from the animated ankle: a foot that foot IK leaves alone
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
@@ -217,14 +219,14 @@ class Animation:
     def cause(
         self, motion: measures.PlacedMotion, ik: jaxik.FootIK | None = None
     ) -> measures.Cause | None:
-        """Why the feet of a motion are off their ground; None where they are not.
+        """Why the feet of a motion are off their ground, or else pop; None where neither is known.
 
         Args:
             motion: on this terrain.
             ik: the system that made it, if one did.
         """
         if not motion.measures.misplaced:
-            return None
+            return None if ik is None else self._late(motion, ik)
         animated, files = self.placed_clip, self.files
         unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
         soles = self.soles(animated)
@@ -232,6 +234,19 @@ class Animation:
         if cause.kind == "unknown" and ik is not None:
             return self._binding_limit(motion, ik) or self._off(motion) or cause
         return cause
+
+    def _late(self, motion: measures.PlacedMotion, ik: jaxik.FootIK) -> measures.Cause | None:
+        """That a foot pops out of a step that it met inside, where the system does not look ahead.
+
+        Its rays go down under the foot: at a wall they meet the top once the foot is in it.
+        """
+        measured, (_, frame, leg) = motion.measures, motion.measures.worst["pop"]
+        if isinstance(ik.probe, StrideProbe) or not measured.pop > self.bounds["pop"]:
+            return None
+        first = max(0, frame - round(BEFORE_POP * motion.clip.fps))
+        gap = motion.soles.gap[first : frame + 1, motion.clip.rig.names.index(leg)]
+        depth = float(np.nanmax(-gap, initial=0.0))
+        return measures.Cause("late", depth) if depth > measured.visible else None
 
     def _off(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """That a system has left most of the feet that stand off the ground as animated."""
@@ -544,11 +559,11 @@ def warning_texts(
     Args:
         measured: of a motion.
         bounds: by measure.
-        cause: of feet off their ground; None where they are not.
+        cause: of feet off their ground, or of the pop; None where neither is known.
     """
     texts = [bounded.words for bounded in measured.against(bounds) if bounded.is_beyond]
     if cause is not None:
-        texts.append(f"likely cause of feet off the ground: {cause.words}")
+        texts.append(f"likely cause of {cause.of}: {cause.words}")
     elif math.isnan(measured.contact):
         texts.append("no foot of the animation ever stands; see its contacts with `jaxik inspect`")
     return texts

@@ -541,7 +541,11 @@ def misses(scene: Scene, system: str) -> list[str]:
     if system in compared.failures:
         return [f"no motion: {compared.failures[system]}"]
     cause = compared.causes[system]
-    known = [] if cause is None or cause.kind == "unknown" else [f"likely cause: {cause.kind}"]
+    known = (
+        []
+        if cause is None or cause.kind in ("unknown", "late")
+        else [f"likely cause: {cause.kind}"]
+    )
     beyond = [
         words
         if (reason := reason_of(system, scene.situation.name, name)) is None

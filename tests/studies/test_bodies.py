@@ -225,8 +225,12 @@ def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_
     name, limit, accepted = cause.limit
     assert (name, limit) == ("probe.max_step_up", "0.1 m")
     assert f"{name} is {limit}, and feet stand on it with {accepted}" in cause.words
-    raised = play(parameter_tree.replace(low, {name: float(accepted.removesuffix(" m"))}))
+    accepting = parameter_tree.replace(low, {name: float(accepted.removesuffix(" m"))})
+    raised = play(accepting)
     assert raised.measures.contact > refused.measures.contact + 0.1
+    late = animation.cause(raised, accepting)
+    assert late is not None and late.kind == "late" and late.amount < 0.45
+    assert late.of == "the pop" and animation.cause(raised) is None
     without_system = animation.cause(refused)
     assert without_system is not None and without_system.kind == "unknown"
     never = parameter_tree.replace(low, {name: 0.45, "leg.weight": 0.0})
