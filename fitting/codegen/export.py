@@ -19,7 +19,7 @@ from fitting.runtime.precision import with_floats
 from jaxik.pipeline import step_and_rays
 from jaxik.world.terrain import LegTerrains, Terrain
 
-from . import c_files, cs_files, js_code
+from . import c_code, cs_code, js_code
 from .axes import ENGINES
 from .memory import doubles, rows
 from .program import Program, build
@@ -107,8 +107,8 @@ class Language(NamedTuple):
 
 
 LANGUAGES = {
-    "c": Language(c_files.sources, c_files.check, wide=False),
-    "cs": Language(cs_files.sources, cs_files.check, wide=False),
+    "c": Language(c_code.sources, c_code.check, wide=False),
+    "cs": Language(cs_code.sources, cs_code.check, wide=False),
     "js": Language(js_code.sources, js_code.check, wide=True),
 }
 

@@ -19,7 +19,7 @@ import jaxik
 from jaxik.pipeline.requests import Request
 from jaxik.world.terrain import Hit
 
-from .c_files import filled
+from .c_code import filled
 from .memory import rows, tree_of
 from .program import Program, fields_of
 

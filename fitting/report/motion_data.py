@@ -21,9 +21,9 @@ from fitting.motion import measures
 from fitting.motion.measures import PlacedMotion, Soles
 from jaxik.world import body
 
-from . import bodies, live_data, skin_data, style
+from . import bodies, live_data, style
+from .bodies import Skin
 from .live_data import LiveClip
-from .skin_data import Skin
 
 MAX_RATE = 60.0  # frames per second that are shown
 MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 adds a third
@@ -107,7 +107,7 @@ def pack(clips: Sequence[ViewedClip], spent: int = 0) -> list[dict[str, Any]]:
 def _skins(clip: ViewedClip) -> dict[Model, Skin]:
     """The meshes of the characters of a clip's motions."""
     clips = {each.motion.clip.model: each.motion.clip for each in clip.motions.values()}
-    skins = {model: skin_data.pack(of) for model, of in clips.items() if model is not None}
+    skins = {model: bodies.pack_skin(of) for model, of in clips.items() if model is not None}
     return {model: skin for model, skin in skins.items() if skin is not None}
 
 
@@ -229,7 +229,7 @@ def _pack_skin(
         return {}
     skin, first = skins[clip.model], firsts[clip.model]
     rotations_ws = clip.rotations_ws[::step][:, list(skin.joints)]
-    turns = {"skinned": first, "turns": skin_data.pack_rotations(rotations_ws)}
+    turns = {"skinned": first, "turns": bodies.pack_rotations(rotations_ws)}
     return turns | ({"skin": skin.content} if key == first else {})
 
 
@@ -285,7 +285,7 @@ def solution(clip: Clip, soles: Soles, shown: Mapping[str, Any]) -> dict[str, np
     for skeleton in shown["skeletons"]:
         if "skin" in skeleton:
             rotations_ws = clip.rotations_ws[::step][:, skeleton["skin"]["joints"]]
-            arrays["turns"] = skin_data.rounded_rotations(rotations_ws)
+            arrays["turns"] = bodies.rounded_rotations(rotations_ws)
     return arrays
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.bench import workloads
-from fitting.codegen import c_files, cs_files, meanings, memory, program, toolchain
+from fitting.codegen import c_code, cs_code, meanings, memory, program, toolchain
 from fitting.codegen.axes import ENGINES, conversions
 from jaxik.maths import parameter_tree
 from support import mono
@@ -47,7 +47,7 @@ def compiled(folder, system: program.Program, engine: str | None) -> ctypes.CDLL
     compiler = toolchain.compiler("c")
     if compiler is None:
         pytest.skip("needs a compiler of C: none in $CC, no cc")
-    for file, text in c_files.sources(system, "walker", engine).items():
+    for file, text in c_code.sources(system, "walker", engine).items():
         (folder / file).write_text(text.replace("static inline ", ""))
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "-O0"]
     subprocess.run([compiler, *flags, "walker.c", "-o", "lib.so", "-lm"], cwd=folder, check=True)
@@ -142,7 +142,7 @@ def test_sliders_say_what_each_parameter_is(library, system):
 
 @mono.needs_mono
 def test_sliders_in_csharp_turn_parameters(tmp_path, system):
-    for file, text in cs_files.sources(system, "walker").items():
+    for file, text in cs_code.sources(system, "walker").items():
         (tmp_path / file).write_text(text)
     (tmp_path / "Sliders.cs").write_text(SLIDERS)
     mono.compile_code(tmp_path, "Sliders.exe", "Walker.cs", "Sliders.cs")

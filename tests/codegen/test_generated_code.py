@@ -20,10 +20,8 @@ from fitting.bench import workloads
 from fitting.clips.clip_frames import frames_from_clip
 from fitting.codegen import (
     c_code,
-    c_files,
     crowd,
     cs_code,
-    cs_files,
     export,
     js_code,
     lanes_code,
@@ -388,14 +386,14 @@ def operations(operands, walk) -> program.Program:
 @pytest.fixture
 def no_routines(monkeypatch):
     """As of frames that are rows of operands."""
-    for module in (c_files, cs_code, js_code):
+    for module in (c_code, cs_code, js_code):
         monkeypatch.setattr(module, "routines", lambda program: [])
 
 
 @pytest.mark.usefixtures("no_routines")
 def test_every_operation_gives_the_answers_of_jax(tmp_path, walk, operands, operations):
     rows, expected = operands
-    for file, text in c_files.sources(operations, "rules").items():
+    for file, text in c_code.sources(operations, "rules").items():
         (tmp_path / file).write_text(text)
     compiled = Compiled(operations, tmp_path, "rules", [compiler("c"), "-O0", *C])
     hits = Hit(*(jnp.zeros((len(rows.x), 0, *size), jnp.float32) for size in ((3,), (3,), (), ())))
@@ -411,7 +409,7 @@ def test_every_operation_in_csharp_gives_the_answers_of_jax(
     tmp_path, walk, operands, operations, options
 ):
     rows, expected = operands
-    for file, text in cs_files.sources(operations, "rules").items():
+    for file, text in cs_code.sources(operations, "rules").items():
         (tmp_path / file).write_text(text)
     compiled = Mono(operations, tmp_path, "rules", *options)
     hits = Hit(*(jnp.zeros((len(rows.x), 0, *size), jnp.float32) for size in ((3,), (3,), (), ())))

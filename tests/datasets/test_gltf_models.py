@@ -11,7 +11,7 @@ from fitting.clips import Clip, load_clip, save_clip
 from fitting.clips.formats import gltf_model
 from fitting.clips.formats.gltf import read_tree, rest_places
 from fitting.clips.formats.gltf_document import Document
-from fitting.report import skin_data
+from fitting.report import bodies
 from support.gltf_files import Gltf, skinned_walker, walker
 
 
@@ -104,7 +104,7 @@ def test_a_packed_weight_loses_nothing(clip):
     surface = gltf_model.surface(clip)
     assert surface is not None
     thirds = surface._replace(weights=np.full_like(surface.weights, 0.25))
-    assert set(skin_data._weights(thirds).sum(axis=1)) == {skin_data.FULL}
-    skin = skin_data.pack(clip)
+    assert set(bodies._weights(thirds).sum(axis=1)) == {bodies.FULL}
+    skin = bodies.pack_skin(clip)
     assert skin is not None and skin.joints == tuple(range(9))
     assert skin.content["above"] == list(clip.parents)

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from fitting.codegen.cs_code import pascal
-from fitting.codegen.cs_files import filled
+from fitting.codegen.cs_code import filled, pascal
 from fitting.codegen.program import Program
 from fitting.codegen.toolchain import RAY, Compiled
 

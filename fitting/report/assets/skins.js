@@ -1,4 +1,4 @@
-// Meshes of characters, which follow the joints of a skeleton; packed by fitting/report/skin_data.py.
+// Meshes of characters, which follow the joints of a skeleton; packed by fitting/report/bodies.py.
 
 const SKIN_FIELDS = [["position", 3], ["normal", 3], ["followed", 4], ["weights", 4]];
 
