@@ -323,8 +323,9 @@ def _states_before(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> jaxi
     """The memory before each frame."""
     first = jaxik.init(own_system(ik, scene), scene.rig)
     states = stage_outputs(result).advanced.state
+    first, states = jax.device_get((first, states))
     return jax.tree.map(
-        lambda start, rest: jnp.concatenate([start[None], rest[:-1]]), first, states
+        lambda start, rest: jax.device_put(np.concatenate([start[None], rest[:-1]])), first, states
     )
 
 

@@ -414,7 +414,7 @@ def _pack_heights(field: Heightfield, live: LiveClip, corner: np.ndarray) -> Con
 
 def prepare(ik: jaxik.FootIK, scene: Scene) -> None:
     """Makes the script of a system for a clip, which its page then need not wait for."""
-    first = jax.tree.map(lambda leaf: leaf[0], scene.frames)
+    first = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[0]), scene.frames)
     with suppress(ValueError):  # the page then does without
         script(ik, len(scene.rig.side), scene.terrain, first)
 

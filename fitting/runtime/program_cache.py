@@ -259,7 +259,8 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
         leaves, structure = jax.tree.flatten((args, named))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return inside(*args, **named)
-        leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+        # `jnp.asarray` would compile a program for each shape.
+        leaves = [jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         static = tuple(None if isinstance(leaf, jax.Array) else leaf for leaf in leaves)
         arrays = [leaf for leaf in _committed(leaves) if isinstance(leaf, jax.Array)]
         try:
@@ -398,6 +399,6 @@ def padded_frames(tree: PyTree) -> Any:
         if more:
             rows = np.asarray(x)
             x = np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)])
-        return jnp.asarray(x)
+        return jax.device_put(x)
 
     return jax.tree.map(pad, tree)

@@ -55,7 +55,8 @@ ODD: dict[str, Any] = (  # all parameters away from their defaults
 
 
 def to_transform(t: reference.Transform) -> jaxik.Transform:
-    return jaxik.Transform(jnp.asarray(t.pos), jnp.asarray(t.rot))
+    # `jnp.asarray` would compile a program for each shape.
+    return jaxik.Transform(jax.device_put(t.pos), jax.device_put(t.rot))
 
 
 def to_rig(rig: reference.Rig) -> jaxik.Rig:
@@ -81,7 +82,7 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
     """The frames stacked on a leading axis."""
 
     def stacked(arrays: Iterable[np.ndarray]) -> jax.Array:
-        return jnp.asarray(np.stack(list(arrays)))
+        return jax.device_put(np.stack(list(arrays)))
 
     def transform(name: str) -> jaxik.Transform:
         each = [getattr(frame, name) for frame in frames]
@@ -92,8 +93,8 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
     def platforms(name: str) -> jaxik.Transform:
         poses = [pose for frame in frames for pose in getattr(frame, name)]
         return jaxik.Transform(
-            jnp.asarray(np.reshape([pose.pos for pose in poses], (len(frames), -1, 3))),
-            jnp.asarray(np.reshape([pose.rot for pose in poses], (len(frames), -1, 4))),
+            jax.device_put(np.reshape([pose.pos for pose in poses], (len(frames), -1, 3))),
+            jax.device_put(np.reshape([pose.rot for pose in poses], (len(frames), -1, 4))),
         )
 
     return jaxik.Frame(
