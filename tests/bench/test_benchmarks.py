@@ -434,6 +434,7 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
     assert measure(name).figures
 
 
+@pytest.mark.slow
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
     session = benchmarks.viewed_walk(12)
     (clip,), (system,) = session.clips, session.starts.values()
@@ -457,6 +458,7 @@ def small_problem(monkeypatch):
     monkeypatch.setattr(workloads, "problem", problem)
 
 
+@pytest.mark.slow
 def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interrupted(
     small_problem, monkeypatch
 ):

@@ -103,7 +103,12 @@ def built(engine: str, folder: Path, ik: jaxik.FootIK, rig: jaxik.Rig) -> list[s
 
 
 @pytest.mark.parametrize(
-    "engine", ["unreal", pytest.param("unity", marks=mono.needs_mono), "godot"]
+    "engine",
+    [
+        "unreal",
+        pytest.param("unity", marks=[mono.needs_mono, pytest.mark.slow]),
+        pytest.param("godot", marks=pytest.mark.slow),
+    ],
 )
 def test_a_node_moves_a_character_as_python_does(tmp_path, engine):
     if engine != "unity" and toolchain.compiler("c++") is None:

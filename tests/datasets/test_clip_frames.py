@@ -104,6 +104,7 @@ def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(cl
         np.testing.assert_allclose(cosine, 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_spine_and_head_lean_as_the_system_says(clip, result):
     joints = [("spine", 0, [0.0, 0.1, 0.0]), ("neck", 9, [0.0, 0.4, 0.0])]
     joints += [("arm", 10, [0.2, 0.0, 0.0]), ("head", 10, [0.0, 0.1, 0.0])]

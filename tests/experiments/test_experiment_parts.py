@@ -365,6 +365,7 @@ def test_a_restricted_experiment_is_the_same_when_read_again_or_refused_if_it_co
             restricted(tmp_path, **parts)
 
 
+@pytest.mark.slow
 def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkeypatch):
     rest = "[start]\nfoot.max_pitch = 0.5\ntarget.rise_half_life = 0.1"
     clip = "end = 2.97"  # as long as one that tests/studies/test_drafts.py runs: one program

@@ -29,7 +29,7 @@ from fuzz.trial import OUTCOMES, run_trials, try_to_load
 from jaxik.world import cells
 from support.sample_clips import BVH
 
-COUNT = 30  # files of each format, or more until some are loaded and some refused
+COUNT = 20  # files of each format, or more until some are loaded and some refused
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -190,6 +190,7 @@ def test_noise_is_replaced_without_a_new_program(correlated):
     assert changed.data[0].sigmas.contact == correlated.data[0].sigmas.contact
 
 
+@pytest.mark.slow
 def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
     """Against a quasi-Newton search over parameters, log-sigmas and correlations together."""
     space = correlated.space
@@ -223,6 +224,7 @@ def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
     np.testing.assert_allclose(ours, best.x, atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rho", "outliers", "loss", "options"),
     [

@@ -112,6 +112,7 @@ def test_a_known_normal_is_sampled_with_its_moments_and_intervals():
             assert abs(below - level) < 4 * error < 0.06, (row["name"], name)
 
 
+@pytest.mark.slow
 def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     random = np.random.default_rng(3)
     moments = jnp.linspace(0.02, 0.98, 25)
@@ -144,6 +145,7 @@ def test_a_step_into_nan_is_never_taken_and_a_start_there_is_refused():
 # What a run does
 
 
+@pytest.mark.slow
 def test_a_run_stops_at_fifty_steady_autocorrelation_times_and_a_longer_one_continues_it(tmp_path):
     known, path = normal(2), tmp_path / "a.h5"
     sampled = known.sample(path=path)

@@ -187,6 +187,7 @@ def test_profiles_are_the_same_on_another_number_of_cores(monkeypatch):
         np.testing.assert_array_equal(again.profiles[name].rises, profile.rises)
 
 
+@pytest.mark.slow
 def test_every_parameter_has_a_profile_over_its_whole_range():
     problem, _, report = bumps()
     for free in problem.space.parameters:
@@ -197,6 +198,7 @@ def test_every_parameter_has_a_profile_over_its_whole_range():
         assert curve.rises.min() == 0
 
 
+@pytest.mark.slow
 def test_a_clamp_is_two_sided_if_it_is_reached_and_one_sided_if_it_is_never():
     report = bumps()[2]
     limit = report.profiles["limit"]
@@ -255,6 +257,7 @@ class LettingGo(eqx.Module):
         return jnp.stack([0.3 * remaining, jnp.where(remaining > self.release, 1.0, 0.0)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_intervals_go_on_beyond_cliffs_along_which_parameters_move_together(seed):
     truth = {"half_life": 0.4, "release": 0.2 + 0.1 * seed}

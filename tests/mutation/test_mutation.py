@@ -140,6 +140,7 @@ def test_a_run_tells_caught_mutants_from_survivors_and_keeps_what_it_found(run):
     assert "50.0%" in summary(seen) and f"{MODULE}:15" in summary(seen)
 
 
+@pytest.mark.slow
 def test_a_run_ends_where_tests_fail_without_any_change(run, monkeypatch):
     monkeypatch.setattr(run.survey, "passes", lambda test: False)
     monkeypatch.setattr(run.survey, "asked", lambda *_: ["tests/solvers/test_other.py"])

@@ -138,6 +138,7 @@ def with_bad_frame(clip: jaxik.Frame, bad: int) -> jaxik.Frame:
     return dataclasses.replace(clip, world_from_model=broken, dt=clip.dt.at[bad + 1].set(0.0))
 
 
+@pytest.mark.slow
 def test_the_centre_stays_in_a_bad_frame_and_moves_in_the_next():
     ik, rig, ground, clip = far_walk("record", FURTHEST)
     places = centres(compiled(ik, rig, ground, clip))

@@ -85,6 +85,7 @@ def test_hits_of_rays_replay_the_motion_of_run():
     assert {-1, 0} <= set(np.asarray(hits.platform).ravel().tolist())
 
 
+@pytest.mark.slow
 def test_hits_of_rays_replay_a_frame_as_it_is_on_the_terrain():
     ik, frame = jaxik.presets.unreal(faithful=True), at(clip(), 0)
     still = dataclasses.replace(frame, velocity_ws=jnp.zeros(3))

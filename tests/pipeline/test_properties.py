@@ -416,7 +416,17 @@ def doubles(program):
                 yield from doubles(getattr(inner, "jaxpr", inner))
 
 
-@pytest.mark.parametrize("system", ["record", "ozz", "unreal", "mec", "stride", "by speed"])
+@pytest.mark.parametrize(
+    "system",
+    [
+        "record",
+        "stride",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("ozz", "unreal", "mec", "by speed")
+        ),
+    ],
+)
 def test_a_single_precision_program_contains_no_doubles(system: str):
     assert not list(doubles(traced(system).jaxpr))
     leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))

@@ -147,6 +147,7 @@ def test_a_block_without_frames_is_refused(block):
 # Characters, frames, terrains and memory.
 
 
+@pytest.mark.slow
 def test_several_characters_without_vmap_are_told_of_it_and_pass_with_it():
     for argument, message in {
         "ik": r"^contact.ground_height has shape \(4,\), wanted \(\)",

@@ -205,6 +205,7 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
 
+@pytest.mark.slow
 def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, monkeypatch):
     sizes = []
 
@@ -290,6 +291,7 @@ def test_a_playback_has_the_residuals_of_the_fit_and_rebuilds_captured_joints(fi
     np.testing.assert_allclose(np.cos(played.captured.knee_angle), cosine, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(fitted):
     (scene,) = fitted.problem.data
 
@@ -317,6 +319,7 @@ def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(f
     assert activity.grounded.max() < 1.0, "the hill rises out of reach of the rays"
 
 
+@pytest.mark.slow
 def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     scene, space = fitted.problem.data[0], fitted.problem.space
     base = parameter_tree.replace(space.system, {"lock.enabled": False})
@@ -590,6 +593,7 @@ def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted
     np.testing.assert_array_equal(table[["low95", "high95"]], intervals)
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_the_motion_of_a_fit_and_of_draws_of_a_posterior(tmp_path, monkeypatch):
     monkeypatch.setattr(playback, "measure_activity", lambda *_: [])  # which is not shown
     fitted = runs.with_clips(runs.invented_fit(tmp_path))
@@ -610,6 +614,7 @@ def view_of(text: str, folder: Path) -> Page:
     return Page(path)
 
 
+@pytest.mark.slow
 def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):
     posterior = toy_posterior()
     text = posterior._repr_html_()

@@ -192,6 +192,7 @@ def test_gradients_of_a_bend_match_finite_differences():
     gradients.assert_all_gradients_match(joints, to_hip, to_ankle, hinge, target, pole, *options)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_where_a_limb_has_no_single_answer():
     singular = [np.stack(x) for x in zip(*SINGULAR.values(), strict=True)]
     singular.append(np.full(len(SINGULAR), 0.3))  # twists
@@ -367,6 +368,7 @@ def test_the_hinge_puts_hip_and_ankle_the_wanted_distance_apart(square):
     assert_allclose(distance, wanted, atol=1e-12 if square else 1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_of_swings_and_knees_match_finite_differences():
     bent, target, hinge = (unit(vectors(RNG, 1.0)) for _ in range(3))
     along = np.maximum(np.abs(np.vecdot(bent, hinge)), np.abs(np.vecdot(target, hinge)))

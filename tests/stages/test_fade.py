@@ -122,6 +122,7 @@ def test_feet_land_at_the_speed_of_the_fall():
     assert heights[29] > 0.1 and abs(heights[35]) < 1e-3, "the ground is met within 0.1 s"
 
 
+@pytest.mark.slow
 def test_a_swinging_foot_is_as_animated_where_weights_go_by_contact():
     result, frames = jumped(), jumps()[1]
     ankle = result.pose.ankle.pos

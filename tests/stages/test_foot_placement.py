@@ -294,6 +294,7 @@ def test_feet_and_pelvis_are_turned_as_in_numpy():
         np.testing.assert_allclose(rounded, exact, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_turn_has_right_and_finite_derivatives_all_round():
     _, grounded, weight, points, bearing = (x[:3] for x in directions())
 
@@ -328,11 +329,12 @@ def grounds(probe, simple, frames, weight):
     return jax.vmap(ground_of)(frames, weight)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "probe",
     [
         pytest.param(FootProbe(layers=COMPLEX), id="foot"),
-        pytest.param(StrideProbe(layers=COMPLEX), id="stride", marks=pytest.mark.slow),
+        pytest.param(StrideProbe(layers=COMPLEX), id="stride"),
     ],
 )
 def test_feet_in_flight_see_simple_ground_and_standing_feet_the_other(probe):

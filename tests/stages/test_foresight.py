@@ -109,6 +109,7 @@ def test_labelled_footholds_are_not_read():
     np.testing.assert_array_equal(run(other).pose.ankle.pos, run(frames).pose.ankle.pos)
 
 
+@pytest.mark.slow
 def test_footholds_that_are_known_are_as_without_memory():
     frames = frames_of()
     strides = foreseen(parameter_tree.replace(PREDICTED, {"probe.use_strides": True}), frames)[1]
@@ -146,6 +147,7 @@ def test_memory_agrees_with_the_reference():
                 np.testing.assert_allclose(got[n, leg, [0, 2]], wanted[[0, 2]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
     frames = frames_of()
     memory, stride = jax.tree.map(np.asarray, foreseen(PREDICTED, frames))
@@ -159,6 +161,7 @@ def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
     assert late < 0.5 * early and late < 0.1
 
 
+@pytest.mark.slow
 def test_a_clip_resumed_from_the_memory_of_one_of_its_frames_goes_on_as_the_whole():
     frames = frames_of()
     whole = foreseen(PREDICTED, frames)

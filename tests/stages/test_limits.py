@@ -179,6 +179,7 @@ def test_ground_narrower_than_the_sole_is_refused():
         assert found_on(system("FootProbe"), ground, 0.0)[0] == 1, name
 
 
+@pytest.mark.slow
 def test_feet_stand_over_gaps_narrower_than_half_a_sole_and_step_into_wider_ones():
     ik, heights = system("FootProbe"), {}
     starts = np.zeros((60, 2, 3)) + [0.0, UP_START, 0.0]
@@ -215,6 +216,7 @@ def test_a_foot_may_stand_on_an_edge_and_beside_a_wall():
         assert (found == 1).all()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_where_ground_is_accepted_in_part_or_not_at_all():
     limits = {"max_step_down": 0.1, "min_support": 0.8, "support_radius": 0.1}
     ik, ground = system("FootProbe", True, **limits), to_terrain(bumps())

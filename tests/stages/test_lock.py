@@ -70,6 +70,7 @@ def test_nothing_jumps_at_lock_or_release():
     assert (move <= animated + decay * offset[:-1] + 1e-12).all()
 
 
+@pytest.mark.slow
 def test_a_locked_foot_slips_less_and_lifts_as_animated():
     targets, footholds, unlocked, locked = tracks(slipping())
     locked_twice = locked[1:] & locked[:-1]

@@ -445,10 +445,10 @@ def example_of(name: str) -> tuple[Any, ...]:
     return offsets, StrideWarp, SCALED, (toes, velocity, 1.2), at_rest, (root,)
 
 
-LONGEST = pytest.param("lean", marks=pytest.mark.slow)  # to compile
+NAMES = [*(pytest.param(name, marks=pytest.mark.slow) for name in ("lean", "separation")), "warp"]
 
 
-@pytest.mark.parametrize("name", [LONGEST, "separation", "warp"])
+@pytest.mark.parametrize("name", NAMES)
 def test_single_precision_and_lanes_give_the_same(name):
     function, rule, values, inputs, _, rest = example_of(name)
     assert_single_precision_agrees(jax.jit(function), rule(**values), *inputs, *rest)
@@ -460,7 +460,7 @@ def test_single_precision_and_lanes_give_the_same(name):
     assert_lanes_agree(scaled, jnp.asarray([0.5, 1.0, 1.5]))
 
 
-@pytest.mark.parametrize("name", [LONGEST, "separation", "warp"])
+@pytest.mark.parametrize("name", NAMES)
 def test_derivatives_are_difference_quotients_and_finite_where_formulas_are_singular(name):
     function, rule, values, inputs, singular, rest = example_of(name)
 

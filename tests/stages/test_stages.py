@@ -239,7 +239,7 @@ def test_all_numbers_switches_and_masks_have_a_case(name: str):
     assert {case.leaf for case in CASES[name]} == expected
 
 
-@pytest.mark.parametrize("name", ["record", STRIDE, SPEED])
+@pytest.mark.parametrize("name", [pytest.param("record", marks=pytest.mark.slow), STRIDE, SPEED])
 def test_each_leaf_has_the_expected_effect(name: str):
     by_value = cases.outcomes_of(CASES[name], cases.system(name), sloped=False)
     assert not by_value.without_effect()

@@ -104,7 +104,13 @@ def watch(patch: pytest.MonkeyPatch, stop: Stop, *, interrupted: bool = False) -
     return calls
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name == "fit-many" else pytest.param(name, marks=pytest.mark.slow)
+        for name in STUDIES
+    ],
+)
 def test_an_interrupted_command_goes_on_to_what_an_unbroken_one_finds(
     name, tmp_path, monkeypatch, undrawn
 ):

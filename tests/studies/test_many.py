@@ -108,6 +108,7 @@ def test_a_fit_is_another_one_if_its_experiment_or_a_file_of_it_changes(experime
 # What is kept
 
 
+@pytest.mark.slow
 def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_file, monkeypatch):
     for kept in list(out.glob(f"runs/**/{many_fits.ROW}"))[1:]:
         kept.unlink()
@@ -158,6 +159,7 @@ def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, 
     assert (out / many_fits.CSV).is_file() and not (out / many_fits.PARQUET).exists()
 
 
+@pytest.mark.slow
 def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
     finished, experiment_file, tmp_path, undrawn
 ):
@@ -292,6 +294,7 @@ def test_data_of_32_bits_are_evaluated_by_c_code_alike(problem, ik, systems, cli
         np.testing.assert_allclose(ours[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):
     scene, size = unscaled(problem.data[1]), jnp.asarray(1.3)
     sized = dataclasses.replace(scene, size=size)

@@ -124,6 +124,7 @@ def test_an_outlier_is_found_out(problem):
     assert "largest residual" not in surprises(heavy)["knee"]
 
 
+@pytest.mark.slow
 def test_bands_hold_the_capture_and_are_drawn(replayed):
     channels = ["left, upwards", "left, upwards", "upwards"]
     assert [band.channel for band in replayed.bands[:3]] == channels
@@ -175,6 +176,7 @@ def test_blocks_have_the_likelihood_that_the_fit_has(problem, loss, correlation,
         assert constants[0] == pytest.approx(frames * sum(each))
 
 
+@pytest.mark.slow
 def test_sigmas_of_the_draws_count_in_the_likelihood(problem, replayed):
     posterior = draws_near_the_truth(problem)
     count = posterior.draws_u.shape[0] * posterior.draws_u.shape[1]

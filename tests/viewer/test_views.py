@@ -137,6 +137,7 @@ def cost_of_motion(problem: Problem, u) -> float:
     return 0.5 * float(problem.weight) * float(squares)
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_the_motion_and_cost_of_its_fit_with_rays_and_targets(fitted, solver):
     session = solver.session
     assert list(session.starts) == ["fitted", "before", "default"]

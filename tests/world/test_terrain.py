@@ -422,6 +422,7 @@ def test_a_ray_hits_the_nearest_of_platforms_and_static_ground_and_says_which():
     assert cast(floor, points).platform is None, "what nobody needs costs nothing"
 
 
+@pytest.mark.slow
 def test_the_hit_is_differentiable_in_the_pose_of_its_platform():
     ground = terrain.moving(terrain.mesh(*rough(10)), 0)
 
