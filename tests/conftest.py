@@ -54,7 +54,7 @@ MAX_KEPT = 1e9  # bytes of programs, of old sources most of them
 MAX_MAPPINGS = 40_000  # of memory; Linux ends a process that asks for more than 65,530
 MAX_RESIDENT = 2.5e9  # bytes of one test process after a file,
 MAX_SHARE = 1 / 5  # or this part of the machine's memory, where that is more
-LONGEST = ("test_notebooks.py", "test_documents.py")
+LONGEST = ("test_notebooks.py", "test_documents.py", "test_jobs.py")
 PEAKS: list[int] = []  # bytes of memory of each test process
 
 
