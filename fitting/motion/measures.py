@@ -612,9 +612,10 @@ class Cause(NamedTuple):
         return CAUSES[self.kind].format(self.amount, abs(100 * self.amount), side, *self.limit)
 
     @property
-    def of(self) -> str:
-        """What it causes."""
-        return "the pop" if self.kind == "late" else "feet off the ground"
+    def sentence(self) -> str:
+        """What it causes, the cause, and its remedy."""
+        effect = "the pop" if self.kind == "late" else "feet off the ground"
+        return f"likely cause of {effect}: {self.words}"
 
 
 Trial = Callable[[Cause], Soles | None]

@@ -563,7 +563,7 @@ def warning_texts(
     """
     texts = [bounded.words for bounded in measured.against(bounds) if bounded.is_beyond]
     if cause is not None:
-        texts.append(f"likely cause of {cause.of}: {cause.words}")
+        texts.append(cause.sentence)
     elif math.isnan(measured.contact):
         texts.append("no foot of the animation ever stands; see its contacts with `jaxik inspect`")
     return texts

@@ -490,13 +490,15 @@ def document(comparison: Comparison) -> Document:
 
 
 def _worst(comparison: Comparison) -> Section:
-    """The worst seconds of each system, and what is beyond its bounds or nearest to one."""
+    """The worst seconds of each system, what is beyond its bounds or nearest to one, and why."""
     blocks: list[Block] = []
     for name in comparison.systems:
         start, end = _window(comparison, name)
         fps = comparison.animation.clip.fps
         worst, *others = comparison.against(name) or [UNKNOWN]
         words = [worst.words, *(other.words for other in others if other.is_beyond)]
+        if (cause := comparison.causes.get(name)) is not None:
+            words.append(cause.sentence)
         text = f"`{name}`, {start / fps:.2f} to {end / fps:.2f} s. In the whole clip: "
         blocks += [
             Text(f"{text}{'; '.join(words)}."),

@@ -442,6 +442,9 @@ def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
         "1 of 2 beyond a bound ◐ Worst is deep: "
     )
     assert "penetration 100.0 % of frames (≤ 5.0), worst 10" in page.text
+    cause = compared.causes["deep"]
+    assert compared.causes["close"] is None and cause is not None
+    assert f"; {cause.sentence}." in page.text
     assert "close keeps standing feet on the ground best" in page.text
     assert (
         f"Closest to the captured motion is close, whose ankles are 0.0 cm away (rms), furthest "
