@@ -238,8 +238,8 @@ def test_one_ctrl_c_ends_a_command_with_workers_and_the_same_command_goes_on(tmp
         finally:
             terminal.kill()  # and so its terminal is gone, which ends the command
     text, before = screen.read_text(), whole()
-    assert "Finished: 1 of 2 fits" in text and "Traceback" not in text
-    assert "the same command makes the fit that is missing" in text
+    assert "1 of 2 fits are finished" in text and "Traceback" not in text
+    assert "the same command makes the 1 that is missing" in text
     assert len((out / fit_many.CSV).read_text().splitlines()) == 1 + len(before) == 2
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
     assert done.returncode in (0, 3), done.stderr
