@@ -59,7 +59,7 @@ from .fit import run_folder
 # Of ground that a probe accepts, and by how much `_binding_limit` raises one until feet stand.
 LIMITS_OF_GROUND = ("probe.max_step_up", "probe.max_step_down", "probe.max_slope")
 RAISED = (1.25, 1.5, 2.0, 3.0)
-BEFORE_POP = 0.1  # s, in which a foot that pops out of a step was in it
+BEFORE_POP = 0.2  # s, in which a foot that pops out of a step met it
 UNMOVED = 1e-3  # m, from the animated ankle: a foot that foot IK leaves alone
 NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
@@ -244,9 +244,10 @@ class Animation:
         if isinstance(ik.probe, StrideProbe) or not measured.pop > self.bounds["pop"]:
             return None
         first = max(0, frame - round(BEFORE_POP * motion.clip.fps))
-        gap = motion.soles.gap[first : frame + 1, motion.clip.rig.names.index(leg)]
-        depth = float(np.nanmax(-gap, initial=0.0))
-        return measures.Cause("late", depth) if depth > measured.visible else None
+        before = slice(first, frame + 1), motion.clip.rig.names.index(leg)
+        rise = np.nanmax(np.diff(motion.soles.ground[before], axis=0), initial=0.0)
+        depth = float(np.nanmax(-motion.soles.gap[before], initial=0.0))
+        return measures.Cause("late", depth) if min(rise, depth) > measured.visible else None
 
     def _off(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """That a system has left most of the feet that stand off the ground as animated."""

@@ -39,6 +39,7 @@ from .footsteps import (
 
 MAX_REACH = 0.992  # of a leg's length, to which it extends: the knee keeps 15 degrees
 SETTLE = 0.1  # s, before and after the pelvis gives way to a leg
+
 # Above the pelvis.
 UPPER_JOINTS = ("spine", "chest", "neck", "head",
                 "left_shoulder", "left_elbow", "left_wrist",
@@ -68,6 +69,7 @@ FREEZE_PHASE = 0.43  # of the rear foot; the heel of the front one is just down
 EASE = 0.4  # s, shortest transition between walking and freezing, and of a slip
 SETTLING = 0.25  # fraction of the normal cadence below which feet settle flat; both are down then
 
+X, Y, Z = np.eye(3)
 BREATH, BREATH_HZ = 0.003, 0.3  # m and Hz: the pelvis of a standing body rises and falls
 
 
@@ -293,9 +295,6 @@ def _smooth_noise(phase: np.ndarray, strides: int, rng: np.random.Generator) -> 
     values = rng.normal(size=strides + 1)
     stride = np.floor(phase).astype(int)
     return values[stride] + smoothstep(phase - stride) * (values[stride + 1] - values[stride])
-
-
-X, Y, Z = np.eye(3)
 
 
 def upper_body(

@@ -232,6 +232,8 @@ def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_
     assert late is not None and late.kind == "late" and late.amount < 0.45
     assert late.sentence.startswith("likely cause of the pop: rays met the step only once")
     assert animation.cause(raised) is None
+    even = replace(raised.soles, ground=np.zeros_like(raised.soles.ground))
+    assert animation.cause(replace(raised, soles=even), accepting) is None
     without_system = animation.cause(refused)
     assert without_system is not None and without_system.kind == "unknown"
     never = parameter_tree.replace(low, {name: 0.45, "leg.weight": 0.0})

@@ -351,8 +351,8 @@ def test_two_bodies_of_equal_shape_move_alike(name):
         legs = np.abs(result.pose.ankle.pos / SIZE - small.pose.ankle.pos).max()
         return float(max(legs, np.abs(result.body.pos / SIZE - small.body.pos).max()))
 
-    # The probe of `stride` rounds distances of a micrometre, whatever the body. A leg of `mec` at
-    # its limit moves by the root of what is rounded: heights changed by 1e-15 move it by 5e-10 m.
+    # The probe of `stride` rounds distances of a micrometre, whatever the body. `mec`
+    # magnifies rounding in legs whose targets are out of reach: 1e-15 of a height moves 5e-10 m.
     assert difference(large) < {"stride": 1e-5, "mec": 1e-6}.get(name, 1e-8)
     assert difference(unscaled) > 3e-3
     assert np.abs(small.body.pos).max() > 0.02, "there was something to do"
