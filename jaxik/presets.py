@@ -40,7 +40,7 @@ from jaxik.world.skeleton import Rig
 # For locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing.
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
 SlopeFoot = functools.partial(
-    PitchRollFoot, max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6
+    PitchRollFoot, max_pitch=0.9, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6
 )
 """A foot with limits, rad, within which its sole lies on slopes of 25 degrees."""
 
@@ -239,8 +239,7 @@ def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
             max_step_up=0.6,
             max_step_down=0.6,
             max_slope=1.05,
-            # Less steep where a prediction may still change: feet pop less.
-            steepness=1.875 if foretold else 1.6,
+            steepness=1.55,  # with minimum jerk, feet pop by 5 mm more on stairs
             slide_to_support=True,
             remember_swings=not foretold,
         ),
@@ -250,7 +249,11 @@ def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
         pelvis=ReachPelvis(
-            landing_time=0.12, rise_half_life=0.07, fall_half_life=0.04, spring=True
+            softness=0.033,
+            landing_time=0.14,
+            rise_half_life=0.095,
+            fall_half_life=0.045,
+            spring=True,
         ),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),

@@ -416,14 +416,6 @@ LIMITATIONS = (
         "mec", "carried idle", "foot_skating",
         "its original plants feet with which nobody steps; they go back once they are let go",
     ),
-    Limitation(
-        "stride", f"stairs up, leaning stairs up, {SLOPES}", "pelvis_jerk",
-        "its pelvis sinks as fast as a trailing leg gets too long",
-    ),
-    Limitation(
-        "stride", "leaning stairs up", "pop",
-        "its pelvis sinks as fast as a trailing leg gets too long",
-    ),
 )  # fmt: skip
 """What the presets miss."""
 

@@ -103,7 +103,7 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
   unlock_half_life=0.05 return_speed=0.6;
   FootSeparation; LowestPelvis wait_to_rise=yes min_extension=0.36; DirectEffector;
   TwoBone as_animated=yes;
-  PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
+  PitchRollFoot max_pitch=0.9 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
   OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade
 ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no; SoleTarget; NoLean;
@@ -129,11 +129,13 @@ mec!: StandingContact; GroundRoot enabled=no cross_gaps=no; StrideWarp; CornerPr
   SoleTarget max_slope=0 foot_height=0.1; NoLean; PlantLock; NoSeparation; LegLengthPelvis;
   FadeEffector; PoleLeg to_hint=yes allow_stretch=yes; FlatFoot; NoFade
 stride: LabelContact; KeepRoot; StrideWarp;
-  StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes;
+  StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 steepness=1.55
+  slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
-  ReachPelvis landing_time=0.12 rise_half_life=0.07 fall_half_life=0.04 spring=yes; HeelEffector;
+  ReachPelvis softness=0.033 landing_time=0.14 rise_half_life=0.095 fall_half_life=0.045
+  spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
-  PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
+  PitchRollFoot max_pitch=0.9 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 """
 WORDS = {"yes": 1.0, "no": 0.0}
 

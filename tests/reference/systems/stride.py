@@ -19,8 +19,8 @@ FASTEST = 2.0  # m/s, of a root that climbs
 # The alternatives in the stages that have two rules.
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
-    "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.025, shift=0.15)
-    | named("pelvis", rise_half_life=0.07, fall_half_life=0.04, spring=True, landing_time=0.12)
+    "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.033, shift=0.15)
+    | named("pelvis", rise_half_life=0.095, fall_half_life=0.045, spring=True, landing_time=0.14)
     | named("pelvis", rise_speed=0.3, most_shift=0.04),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
@@ -34,7 +34,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
     return (
         {**of_record, **CONTACTS[contact], **PELVISES[pelvis], **spine.DEFAULTS}
         | named("probe", ray_up=1.0, ray_down=1.0, layers=ALL_LAYERS, clearance=0.0)
-        | named("probe", rise_start=0.0, rise_end=1.0, steepness=1.875)
+        | named("probe", rise_start=0.0, rise_end=1.0, steepness=1.55)
         | named("probe", max_step_up=0.6, max_step_down=0.6, max_slope=1.05)
         | named("probe", heel_length=0.07, ball_height=0.055, toe_length=0.04, toe_clearance=0.03)
         | named("probe", held_lift=0.6, lift_per_rise=0.5, lift_ahead=0.85, lift_per_fall=0.35)
@@ -45,7 +45,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         | {"target.max_ankle_height": 0.8, "lock.enabled": False, "lock.hold_ball": True}
         | named("effector", extension=0.98, max_lift=0.6)
         | named("leg", max_knee_angle=math.pi, soften=0.985, as_animated=True)
-        | named("foot", max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
+        | named("foot", max_pitch=0.9, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
     )
 
 
