@@ -530,11 +530,24 @@ def model_around(
     The grouping is for each free parameter; the prior is approximated at the centre, in u.
     """
     smooth = np.flatnonzero(space.smooth)
+    information = likelihoods.information[:, smooth][:, :, smooth]
+    return smooth_model(information, likelihoods.vector[:, smooth], space, grouping, centre)
+
+
+def smooth_model(
+    information: Float[np.ndarray, "clips smooth smooth"],
+    vector: Float[np.ndarray, "clips smooth"],
+    space: Space,
+    grouping: Grouping,
+    centre: Float[np.ndarray, " free"],
+) -> MixedModel:
+    """The same, with the information and the vector of the smooth parameters alone."""
+    smooth = np.flatnonzero(space.smooth)
     prior = approximate_prior(space.prior, centre)
     return MixedModel(
         grouping=grouping.of(smooth),
-        information=likelihoods.information[:, smooth][:, :, smooth],
-        vector=likelihoods.vector[:, smooth],
+        information=information,
+        vector=vector,
         prior_information=prior.information[smooth],
         prior_vector=(prior.information * centre - prior.gradient)[smooth],
         spread_scale=np.asarray(space.prior.sd, float)[smooth],

@@ -37,12 +37,13 @@ from fitting.inference.mixed_model import (
     expand,
     fit_population,
     model_around,
+    smooth_model,
 )
 from fitting.inference.noise import NoiseModel, NoiseOptions, with_noise
 from fitting.inference.optimise.checkpoints import Checkpoints
 from fitting.motion import accuracy
 from fitting.motion.accuracy import ACCURACY, IN_BRIEF, Accuracy, position_error
-from fitting.problem.problem import Problem
+from fitting.problem.problem import Problem, digest, digest_with
 from fitting.problem.space import INTERVAL, Space
 from fitting.report import pages, style
 from fitting.report.document import (
@@ -71,7 +72,7 @@ from .fit.assess import search_identity, search_with_noise
 from .fit.fit import SearchRecord, record_search
 from .output import as_experiment, output_folder, publish
 
-SEARCHES = "searches"
+SEARCHES, FITS = "searches", "fits"
 DRAWS = 2000  # from the hierarchy
 NORMAL = 1.96  # standard deviations in half a 95 % interval
 EVERYTHING = "all clips"
@@ -198,6 +199,81 @@ def search_store(folder: Path | None, size: int) -> Store[SearchResult]:
             NoiseModel(**result["noise"])  # checks its numbers
 
     return Store(RESULT_FILE, folder, check=check)
+
+
+class FitResult(TypedDict):
+    """The fit of a population, as its file holds it; `PopulationFit` explains the entries."""
+
+    centre: list[Finite]
+    clips: list[list[Finite]]
+    spread: list[Finite]
+    information: list[list[list[Finite]]]
+    """Of the mixed model, like the vector."""
+    vector: list[list[Finite]]
+    cost: Finite
+    log_probability: Finite
+    rounds: int
+    converged: bool
+
+
+FIT_FILE = JsonFile(FitResult, "written by `jaxik population`", "delete it, and it is made anew")
+
+
+def fit_or_recall(
+    problems: Sequence[Problem[jaxik.FootIK]],
+    grouping: Grouping,
+    starts: Sequence[Float[np.ndarray, "clips free"]],
+    folder: Path | None,
+) -> PopulationFit:
+    """The result of `fit_population`, the stored one or a new one, which is stored.
+
+    Raises:
+        ValueError: a file in the folder is something else.
+    """
+    space, count = problems[0].space, len(problems)
+    size, smooth = space.size, sum(space.smooth)
+    shapes = {
+        "centre": (size,),
+        "clips": (count, size),
+        "spread": (size,),
+        "information": (count, smooth, smooth),
+        "vector": (count, smooth),
+    }
+
+    def check(result: FitResult) -> None:
+        for name, shape in shapes.items():
+            if (stored := np.shape(result[name])) != shape:
+                raise ValueError(f"{name} has shape {stored}; wanted {shape}")
+
+    def fit() -> FitResult:
+        fitted = fit_population(problems, grouping, starts)
+        return {
+            "centre": fitted.centre.tolist(),
+            "clips": fitted.clips.tolist(),
+            "spread": fitted.spread.tolist(),
+            "information": fitted.model.information.tolist(),
+            "vector": fitted.model.vector.tolist(),
+            "cost": fitted.cost,
+            "log_probability": fitted.log_probability,
+            "rounds": fitted.rounds,
+            "converged": fitted.converged,
+        }
+
+    begins = [np.asarray(start).tolist() for start in starts]
+    key = digest_with(problems[0], list(map(digest, problems)), grouping.group.tolist(), begins)
+    store = Store(FIT_FILE, None if folder is None else folder / FITS, check=check)
+    result = store.remember(f"{key[:16]}.json", fit)
+    arrays = {name: np.array(result[name], float) for name in shapes}
+    information, vector = arrays.pop("information"), arrays.pop("vector")
+    return PopulationFit(
+        **arrays,
+        model=smooth_model(information, vector, space, grouping, arrays["centre"]),
+        smooth=np.asarray(space.smooth),
+        cost=result["cost"],
+        log_probability=result["log_probability"],
+        rounds=result["rounds"],
+        converged=result["converged"],
+    )
 
 
 class Estimate(TypedDict):
@@ -415,6 +491,7 @@ def predict(
     fit: PopulationFit,
     pooled: Float[np.ndarray, " free"],
     clip: int,
+    folder: Path | None = None,
 ) -> Float[np.ndarray, " free"]:
     """The parameters of a clip, in u, as the population of the others expects them.
 
@@ -423,7 +500,8 @@ def predict(
     """
     rest = [problem for c, problem in enumerate(problems) if c != clip]
     starts = [np.tile(pooled, (len(rest), 1)), np.delete(fit.clips, clip, axis=0)]
-    return fit_population(rest, grouping.without(clip), starts).predict(grouping, clip)
+    others = fit_or_recall(rest, grouping.without(clip), starts, folder)
+    return others.predict(grouping, clip)
 
 
 def error_at(problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"]) -> float:
@@ -517,7 +595,7 @@ def fit_clips_and_population(
     clips counts as noise, and is taken from there.
 
     Raises:
-        KeyboardInterrupt: it was interrupted; finished searches are in the folder.
+        KeyboardInterrupt: it was interrupted; finished searches and fits are in the folder.
         ValueError: nothing varies, or a threshold does; the folder holds something else.
     """
     if not experiment.hierarchy.varying:
@@ -558,12 +636,12 @@ def fit_clips_and_population(
     )
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     with activity.announced("Fitting the population"):
-        fit = fit_population(problems, grouping, starts)
+        fit = fit_or_recall(problems, grouping, starts, folder)
     errors = []
     for c, name in enumerate(clips):
         others_u = np.array(fits[everything - {c}]["u"])
         with activity.announced(f"Predicting {name} from the others"):
-            expected = predict(problems, grouping, fit, others_u, c)
+            expected = predict(problems, grouping, fit, others_u, c, folder)
             points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
             errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
     levels = [experiment.hierarchy.level(name) for name in names]

@@ -195,6 +195,23 @@ def test_only_other_settings_are_searched_anew(made, tmp_path, monkeypatch, undr
 # Report and command
 
 
+def test_finished_fits_are_recalled_to_the_last_bit(made, tmp_path, monkeypatch, undrawn):
+    out = tmp_path / "out"
+    for name in (population.SEARCHES, population.FITS):
+        shutil.copytree(made.folder / name, out / name)
+    fits = sorted((out / population.FITS).iterdir())
+    assert len(fits) == 4  # all, and all but each
+    path = small_studies.quick_population(tmp_path, monkeypatch)
+    monkeypatch.setattr(population, "fit_population", None)
+    again, before = fitting.population(path, out).fit, made.fitted.fit
+    for name in ("centre", "clips", "spread"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
+    np.testing.assert_array_equal(again.model.prior_vector, before.model.prior_vector)
+    fits[0].write_text(json.dumps(json.loads(fits[0].read_text()) | {"spread": [0.0]}))
+    with pytest.raises(ValueError, match=r"spread has shape \(1,\); wanted \(2,\).*; delete it"):
+        fitting.population(path, out)
+
+
 def test_the_folder_has_a_report_and_parameters(made):
     out, printed = made.folder, made.printed
     assert "fitting 2 parameters of record to 3 clips, 1 of them varying" in printed
