@@ -250,10 +250,10 @@ def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
         separation=FootSeparation(),
         # As smooth as it may be if standing feet are to reach their treads on any stairs.
         pelvis=ReachPelvis(
-            softness=0.033,
-            landing_time=0.14,
-            rise_half_life=0.095,
-            fall_half_life=0.045,
+            softness=0.04,
+            landing_time=0.2,
+            rise_half_life=0.08,
+            fall_half_life=0.041,
             spring=True,
         ),
         effector=HeelEffector(),

@@ -132,7 +132,7 @@ stride: LabelContact; KeepRoot; StrideWarp;
   StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 steepness=1.55
   slide_to_support=yes;
   SlopeTarget max_ankle_height=0.8; SpineLean; OffsetLock enabled=no hold_ball=yes; FootSeparation;
-  ReachPelvis softness=0.033 landing_time=0.14 rise_half_life=0.095 fall_half_life=0.045
+  ReachPelvis softness=0.04 landing_time=0.2 rise_half_life=0.08 fall_half_life=0.041
   spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
   PitchRollFoot max_pitch=0.9 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade

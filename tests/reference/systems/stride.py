@@ -19,8 +19,8 @@ FASTEST = 2.0  # m/s, of a root that climbs
 # The alternatives in the stages that have two rules.
 CONTACTS = {"label": {"contact.ground_height": 0.0}, "speed": ground.BY_SPEED}
 PELVISES = {
-    "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.033, shift=0.15)
-    | named("pelvis", rise_half_life=0.095, fall_half_life=0.045, spring=True, landing_time=0.14)
+    "reach": named("pelvis", highest_share=0.75, extension=0.958, softness=0.04, shift=0.15)
+    | named("pelvis", rise_half_life=0.08, fall_half_life=0.041, spring=True, landing_time=0.2)
     | named("pelvis", rise_speed=0.3, most_shift=0.04),
     "support": named("pelvis", lowest_share=0.3, rise_half_life=0.1, fall_half_life=0.1)
     | {"pelvis.spring": False},
