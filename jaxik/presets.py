@@ -40,7 +40,7 @@ from jaxik.world.skeleton import Rig
 # For locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing.
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
 SlopeFoot = functools.partial(
-    PitchRollFoot, max_pitch=0.9, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6
+    PitchRollFoot, max_pitch=1.0, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6
 )
 """A foot with limits, rad, within which its sole lies on slopes of 25 degrees."""
 

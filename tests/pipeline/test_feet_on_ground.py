@@ -250,7 +250,7 @@ def test_a_walker_keeps_its_soles_on_the_slope(footholds: str):
     assert stands.mean() > 0.2 and swings.mean() > 0.2
     for slope, animated, solved, heel_lifted in soles_of(figures()[footholds]):
         heel, ball = np.moveaxis(solved - animated, -1, 0)
-        assert np.abs(ball[stands]).max() < 0.005, slope
+        assert np.abs(ball[stands]).max() < 0.007, slope
         assert heel[stands].min() > -0.005, f"{slope}: heels may rise, but not sink"
         assert np.abs(heel[stands & ~heel_lifted]).max() < 0.005, slope
         sunk = np.minimum(solved, 0.0) - np.minimum(animated, 0.0)

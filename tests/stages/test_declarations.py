@@ -103,7 +103,7 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
   unlock_half_life=0.05 return_speed=0.6;
   FootSeparation; LowestPelvis wait_to_rise=yes min_extension=0.36; DirectEffector;
   TwoBone as_animated=yes;
-  PitchRollFoot max_pitch=0.9 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
+  PitchRollFoot max_pitch=1 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
   OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade
 ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no; SoleTarget; NoLean;
@@ -135,7 +135,7 @@ stride: LabelContact; KeepRoot; StrideWarp;
   ReachPelvis softness=0.04 landing_time=0.2 rise_half_life=0.08 fall_half_life=0.041
   spring=yes; HeelEffector;
   TwoBone max_knee_angle=3.14159 soften=0.985 as_animated=yes;
-  PitchRollFoot max_pitch=0.9 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
+  PitchRollFoot max_pitch=1 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 """
 WORDS = {"yes": 1.0, "no": 0.0}
 

@@ -22,7 +22,7 @@ STANDS_BY_SPEED = (
     | named("lock", relock_threshold=0.5, unlock_half_life=0.05, return_speed=0.6)
     | {"pelvis.wait_to_rise": True, "pelvis.min_extension": 0.36}
     | {"leg.as_animated": True, "leg.soften": 0.98}
-    | named("foot", max_pitch=0.9, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
+    | named("foot", max_pitch=1.0, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
 )
 __all__ = ["DEFAULTS", "Frame", "Ground", "Parameters", "Rig", "State", "Transform", "run", "step"]
 

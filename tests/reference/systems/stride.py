@@ -45,7 +45,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         | {"target.max_ankle_height": 0.8, "lock.enabled": False, "lock.hold_ball": True}
         | named("effector", extension=0.98, max_lift=0.6)
         | named("leg", max_knee_angle=math.pi, soften=0.985, as_animated=True)
-        | named("foot", max_pitch=0.9, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
+        | named("foot", max_pitch=1.0, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6)
     )
 
 
