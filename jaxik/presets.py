@@ -248,7 +248,7 @@ def stride(rig: Rig | None = None, *, foretold: bool = True) -> FootIK:
         lean=SpineLean(pelvis_rate=body.pitch_rate(rig, -0.25)),
         lock=OffsetLock(enabled=False, hold_ball=True),
         separation=FootSeparation(),
-        # As smooth as it may be if standing feet are to reach their treads on any stairs.
+        # As smooth as it may be if standing feet are to reach their treads on 500 random stairs.
         pelvis=ReachPelvis(
             softness=0.04,
             landing_time=0.2,

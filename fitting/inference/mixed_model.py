@@ -541,7 +541,7 @@ def smooth_model(
     grouping: Grouping,
     centre: Float[np.ndarray, " free"],
 ) -> MixedModel:
-    """The same, with the information and the vector of the smooth parameters alone."""
+    """The model of `model_around` from the information and vector of its smooth parameters."""
     smooth = np.flatnonzero(space.smooth)
     prior = approximate_prior(space.prior, centre)
     return MixedModel(

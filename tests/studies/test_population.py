@@ -192,9 +192,6 @@ def test_only_other_settings_are_searched_anew(made, tmp_path, monkeypatch, undr
     assert searched == ["uneven_walk from 0 s"]
 
 
-# Report and command
-
-
 def test_finished_fits_are_recalled_to_the_last_bit(made, tmp_path, monkeypatch, undrawn):
     out = tmp_path / "out"
     for name in (population.SEARCHES, population.FITS):
@@ -210,6 +207,9 @@ def test_finished_fits_are_recalled_to_the_last_bit(made, tmp_path, monkeypatch,
     fits[0].write_text(json.dumps(json.loads(fits[0].read_text()) | {"spread": [0.0]}))
     with pytest.raises(ValueError, match=r"spread has shape \(1,\); wanted \(2,\).*; delete it"):
         fitting.population(path, out)
+
+
+# Report and command
 
 
 def test_the_folder_has_a_report_and_parameters(made):
