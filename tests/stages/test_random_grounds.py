@@ -27,12 +27,11 @@ class Exceptions(NamedTuple):
 
 ON_GROUND = {
     "stride": Exceptions(
-        "a sole lies along the flank of a root or the side of a gap on which its ball is; onto "
-        "furniture and off it, a swing goes over two edges",
+        "a rolling sole is over a gap as wide as what it could slide by; a swing of 0.4 s goes "
+        "over a bench of 30 cm",
         {
-            "roots": BOUNDS._replace(off=0.30),
-            "gaps": BOUNDS._replace(off=0.45, pop=0.05, bend=0.08),
-            "furniture": BOUNDS._replace(off=0.03, pop=0.08, dip=0.02, bend=0.18),
+            "gaps": BOUNDS._replace(off=0.07),
+            "furniture": BOUNDS._replace(pop=0.06, dip=0.015, bend=0.12),
         },
     ),
     "record": Exceptions(
@@ -80,6 +79,8 @@ NOTICED = Motion(pop=0.025, body=0.02, far=0.20)
 IN_STATES = dict.fromkeys(ON_GROUND, NOTICED) | {
     # While both legs hardly count, the body goes with the one that counts more.
     "stride": NOTICED._replace(pop=0.04, body=0.04),
+    # As in the original, its pelvis closes a quarter of its gap of up to 12 cm in 1/60 s.
+    "unreal": NOTICED._replace(pop=0.03, body=0.03),
     # A squatter on a terrace is lifted until its legs have their least length.
     "mec": NOTICED._replace(far=0.30),
 }

@@ -72,7 +72,9 @@ def step_up(height: float) -> PlainTerrain:
 
 STEP_UP, FLOOR = step_up(0.25), level_blocks((-3.0, 3.0, 0.0))
 STEP_DOWN = level_blocks((-3.0, 0.5, 0.25), (0.5, 3.0, 0.0))
-HURDLE = level_blocks((-3.0, 0.35, 0.0), (0.35, 0.45, 0.2), (0.45, 3.0, 0.0))
+HURDLE, HIGH_HURDLE = (
+    level_blocks((-3.0, 0.35, 0.0), (0.35, 0.45, height), (0.45, 3.0, 0.0)) for height in (0.2, 0.4)
+)
 CLIFF = level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -0.8))
 FINE = np.linspace(0.0, 1.0, 801)
 
@@ -244,6 +246,15 @@ def sole() -> float:
     return HEEL + float(pose.toe.pos[2] - pose.ankle.pos[2]) + TOE
 
 
+def test_a_ball_over_a_narrow_gap_slides_to_its_rim_however_deep_it_is():
+    """Deeper than a foot can step down, too: the rims are over the ground below the foot."""
+    for depth in (0.3, 0.61):
+        gap = level_blocks((-3.0, -0.03, 0.0), (-0.03, 0.03, -depth), (0.03, 3.0, 0.0))
+        slide, _, height = slides(gap)
+        assert np.abs(height).max() < 1e-6
+        assert np.abs(slide[np.abs(PLACES) < 0.02]).min() > 0.02
+
+
 def test_a_lower_limit_makes_slides_shorter():
     """They go in tenths of a sole, of 0.026 m, and no further than they need to."""
     longest = [np.abs(slides(DROP_BEHIND, max_slide=x)[0]).max() for x in (0.0, 0.06, 0.1)]
@@ -329,6 +340,13 @@ def test_steps_higher_than_captured_ones_change_a_swing_no_more(way: float):
     for name in ("lift", "pitch"):
         assert_close(getattr(higher, name), getattr(high, name), 1e-9)
         assert np.abs(getattr(low, name) - getattr(high, name)).max() > 0.02
+
+
+def test_a_hurdle_higher_than_captured_ones_is_passed_no_further_away():
+    low, high = (hits(ground) for ground in (HURDLE, HIGH_HURDLE))
+    heights = [x.ankle.point[..., 1] + x.lift for x in (low, high)]
+    assert 0.18 < (heights[1] - heights[0]).max() < 0.22  # m, for 0.2
+    assert_close(high.pitch, low.pitch, 1e-9)
 
 
 def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():

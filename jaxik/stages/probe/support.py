@@ -120,11 +120,15 @@ class AbstractSupportedProbe(AbstractSwingProbe):
 
         foothold = self.ground_at(inputs, level, footholds_ws)
         margin = self.margin_at(level, footholds_ws)
-        # From where a step up from the foothold ends or, without one, from the character's level.
-        top = self.max_step_up + lerp(margin, level.height(foothold.point), foothold.found)
+        # From where a step up from the foothold or from the character's level ends, so that in a
+        # gap its rims are seen, down to where a step down from the foothold ends.
+        height = level.height(foothold.point)
+        above = lerp(margin, jnp.where(height > 0, height, 0.0), foothold.found)
+        below = lerp(-margin, height, foothold.found)
         steps = vec.scale(ahead_ws, tenth) * jnp.asarray(LINE, tenth.dtype)[:, None, None, None]
-        starts = level.project(footholds_ws) + steps + vec.scale(up, top)
-        reach = self.max_step_up + self.max_step_down + 2.0 * margin * (1.0 - foothold.found)
+        starts = level.project(footholds_ws) + steps
+        starts += vec.scale(up, self.max_step_up + above)
+        reach = self.max_step_up + self.max_step_down + above - below
         line = cast(inputs.terrain, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
         heights = level.height(line.point)  # (points ends legs)
         firm = line.found * self.trust_from(level.origin_ws, line, up, margin)

@@ -21,6 +21,7 @@ SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0
 # When a swing changes most, as a fraction of it: measured on people who walk over blocks.
 HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
 TOES_UP, TOES_DOWN = 0.23, 0.75
+HIGHEST_OVER = 0.175  # m over both footholds, the highest that they went over
 ON_HEEL = 0.08  # rad, toes up, from which a foot of the animation is on its heel
 
 
@@ -67,7 +68,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape was read off a
     captured walk over blocks; where the ground is as even as in the animation nothing is added.
     Steps higher than `highest_step`, the highest of that walk, add no more than it does: several
-    stairs at once are no reason to lift a foot far above them.
+    stairs at once are no reason to lift a foot far above them. Nor does it pass over an obstacle
+    at a greater distance than over the highest of that walk.
     """
 
     clearance: Leaf = length(
@@ -163,7 +165,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         """
         x = stride.fraction
         rise, fall = self._height_of_step(step), self._height_of_step(-step)
-        total = rise + fall + over
+        low_over = jnp.where(over < HIGHEST_OVER, over, HIGHEST_OVER)
+        total = rise + fall + low_over
         uneven = smoothstep(total / self.uneven_height)
         lift = uneven * (
             self.toe_clearance * bump(x, CLEAR)
@@ -174,7 +177,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         high = self.lift_per_rise * (rise - ahead) + self.lift_ahead * ahead * low
         lift += high * bump(x, RISE)
         lift += self.lift_per_fall * fall * bump(x, FALL)
-        lift += self.lift_over * over * bump(x, OVER)
+        lift += self.lift_over * low_over * bump(x, OVER) + (over - low_over) * arc(x)
         down = uneven * self.toes_down + self.toes_down_per_height * total
         # Only feet swing as people swing them.
         share = jnp.where(self.swing_as_animated, 0.0, trust) * inputs.bearing
@@ -285,8 +288,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         pitched = ankle + quat.rotate(pitch_rotation(inputs, swing.pitch), soles - ankle)
         lift += level.height(pitched) - level.height(soles)
         lowest = inputs.gate.minimum(jnp.moveaxis(lift, 0, -1), band=HEIGHT_BAND)
-        arc = edge * 0.5 * (1.0 - jnp.cos(2.0 * jnp.pi * stride.fraction))
-        gap, blend = arc - lowest, BLEND * arc
+        least = edge * arc(stride.fraction)
+        gap, blend = least - lowest, BLEND * least
         return 0.5 * (gap + vec.safe_sqrt(gap * gap + blend * blend))
 
 
@@ -305,6 +308,11 @@ def bump(fraction: Array, peak: float) -> Array:
     x = jnp.where(inside, fraction, 0.5)
     log = peak * jnp.log(x / peak) + (1.0 - peak) * jnp.log((1.0 - x) / (1.0 - peak))
     return jnp.where(inside, jnp.exp(SHARPNESS * log), 0.0)
+
+
+def arc(fraction: Array) -> Array:
+    """A wide arc over 0..1, whose top, 1, is in the middle."""
+    return 0.5 * (1.0 - jnp.cos(2.0 * jnp.pi * fraction))
 
 
 def pitch_rotation(inputs: Inputs, pitch: Array) -> Float[Array, "legs 4"]:

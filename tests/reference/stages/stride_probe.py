@@ -35,6 +35,7 @@ UNEVEN = 0.05  # m
 HIGHEST = 0.3  # m, of the steps that people were captured on
 ON_HEEL = 0.08  # rad
 HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
+HIGHEST_OVER = 0.175  # m
 TOES_UP, TOES_DOWN = 0.23, 0.75
 
 
@@ -189,15 +190,16 @@ def slide(leg: Leg, level_point: Array, heading: Array, known: bool) -> Slide:
     sole = between + leg["probe.heel_length"] + leg["probe.toe_length"]
     highest, deepest = leg["probe.max_step_up"], leg["probe.max_step_down"]
     if foothold.found:
-        start, reach = height(leg, foothold.point) + highest, highest + deepest
+        lowest = height(leg, foothold.point) - deepest
+        start = max(height(leg, foothold.point), 0.0) + highest
     else:
         way = length(level_point - leg.frame.world_from_model.pos)
         margin = STAIRS * max(way - highest, 0.0)
-        start, reach = highest + margin, highest + deepest + 2.0 * margin
+        start, lowest = highest + margin, -deepest - margin
     hits = {
         place: leg.terrain.cast(
             level_point + place / 10.0 * sole * heading + start * up,
-            reach,
+            start - lowest,
             int(leg["probe.layers"]),
         )
         for place in range(HEEL - FURTHEST, TIP + FURTHEST + 1)
@@ -435,7 +437,8 @@ def beyond_animation(leg: Leg, ball: UnderBall, below: float, above: float) -> t
     fraction, ball_ws = ball.stride.fraction, leg.pos_ws("toe")
     animated = max(height(leg, ball_ws) - leg["probe.ball_height"], 0.0)
     step = clip(ball.step, -HIGHEST, HIGHEST)
-    effort = abs(step) + ball.over
+    over = min(ball.over, HIGHEST_OVER)
+    effort = abs(step) + over
     uneven = smooth01(effort / UNEVEN)
     lift = uneven * leg["probe.toe_clearance"] * bump(fraction, CLEAR)
     lift -= uneven * leg["probe.held_lift"] * animated * bump(fraction, HELD)
@@ -443,7 +446,8 @@ def beyond_animation(leg: Leg, ball: UnderBall, below: float, above: float) -> t
     lift += leg["probe.lift_per_rise"] * (max(step, 0.0) - ahead) * bump(fraction, RISE)
     lift += leg["probe.lift_ahead"] * ahead * (1.0 - ahead / HIGHEST) * bump(fraction, RISE)
     lift += leg["probe.lift_per_fall"] * max(-step, 0.0) * bump(fraction, FALL)
-    lift += leg["probe.lift_over"] * ball.over * bump(fraction, OVER)
+    lift += leg["probe.lift_over"] * over * bump(fraction, OVER)
+    lift += (ball.over - over) * math.sin(math.pi * fraction) ** 2
     down = uneven * leg["probe.toes_down"] + effort * leg["probe.toes_down_per_height"]
     pitch = uneven * leg["probe.toes_up"] * bump(fraction, TOES_UP)
     pitch -= down * bump(fraction, TOES_DOWN)
