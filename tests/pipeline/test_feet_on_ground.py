@@ -44,10 +44,11 @@ def solve(preset: str, rig: jaxik.Rig, frames: jaxik.Frame) -> jaxik.Result:
 
 @functools.cache
 def captured(path: Path) -> Clip:
-    """The first four seconds; the last frame is repeated where a clip is shorter."""
+    """The first four seconds; a shorter clip goes to and fro, since in a pause any foot may lock."""
     clip = resample(without_t_pose(load_clip(path)), FPS)
     clip = dataclasses.replace(clip, stance=clip.stance_labels())
-    return clip.select(np.minimum(np.arange(FRAMES), clip.frame_count - 1))
+    last = clip.frame_count - 1
+    return clip.select(last - np.abs(np.arange(FRAMES) % (2 * last) - last))
 
 
 def slides(clip: Clip, stance: np.ndarray) -> np.ndarray:
