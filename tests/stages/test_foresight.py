@@ -143,7 +143,8 @@ def test_memory_agrees_with_the_reference():
             assert float(swings.fraction[n, leg]) == pytest.approx(before.fraction, abs=1e-9)
             assert float(swings.time[n, leg]) == pytest.approx(before.time, abs=1e-9)
             assert float(swings.further[n, leg]) == pytest.approx(before.further, abs=1e-9)
-            for got, wanted in ((stride.last_ws, last), (stride.next_ws, following)):
+            first = swings.first_way_ws, before.first_way
+            for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
                 np.testing.assert_allclose(got[n, leg, [0, 2]], wanted[[0, 2]], atol=1e-9)
 
 
@@ -159,6 +160,23 @@ def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
     early, late = (off[swinging & (low <= fraction) & (fraction < high)].mean()
                    for low, high in ((0.2, 0.5), (0.8, 1.0)))  # fmt: skip
     assert late < 0.5 * early and late < 0.1
+
+
+@pytest.mark.slow
+def test_how_sure_a_swing_is_of_its_foothold_agrees_with_the_reference():
+    """On a walk whose swings lead elsewhere by up to a third of their way."""
+    frames, values = walk(RIG, COUNT, start=START), {"probe.stance_time": 0.65}
+    values["probe.swing_time"] = 0.45
+    sure = np.asarray(foreseen(PREDICTED, to_frames(frames))[1].sure)
+    up = reference.maths.Y
+    for leg in range(2):
+        before = None
+        for n, frame in enumerate(frames):
+            planted = bool(frame.stride.standing[leg] > 0.5)
+            before, last, following = reference.follow(values, RIG, frame, leg, planted, up, before)
+            way = reference.across(following - last, up)
+            assert float(sure[n, leg]) == pytest.approx(reference.sureness(before, way), abs=1e-6)
+    assert ((sure > 0.05) & (sure < 0.95)).sum() > 5
 
 
 @pytest.mark.slow

@@ -33,11 +33,11 @@ def test_they_do_so_on_rubble_curbs_ledges_and_ramps():
 
 @pytest.mark.slow
 def test_feet_stand_on_treads_that_nothing_foretells():
-    """From the first stride on; how smoothly they get there is not yet as good in all swings."""
+    """From the first stride on; in one swing of eight they bend more, in one of forty they dip."""
     rng = np.random.default_rng(0)
     chosen = [sample(rng, field=True) for _ in range(500)]
     pairs = walked(jaxik.presets.stride(foretold=False), chosen, known=False)
     verdicts = np.array([verdict for _, verdict in pairs])
     share = (verdicts <= np.array(BOUNDS)).mean(0)
-    assert (share >= Verdict(off=0.98, pop=0.8, dip=0.9, bend=0.4, sunk=1.0)).all()
-    assert (verdicts[:, 1:4] <= [0.06, 0.12, 0.15]).all()
+    assert (share >= Verdict(off=0.99, pop=0.96, dip=0.96, bend=0.85, sunk=1.0)).all()
+    assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.10]).all()

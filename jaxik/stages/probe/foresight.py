@@ -1,5 +1,7 @@
 """Where a swinging foot will land, from its own motion so far: for animations without footholds."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -26,6 +28,8 @@ NEAR = 0.04  # m, from the last foothold, up to which a foot has not left it
 STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
 EARLY, LATE = 0.3, 0.7  # of a swing, between which the foot's own motion takes over from the hip's
 UNSURE, SURE = 0.7, 0.88  # of a swing, between which a foot chooses where it will land
+EARLIER = 0.24  # of a swing, by how much earlier it chooses if the swing goes as foreseen
+AS_FORESEEN, OTHERWISE = 0.1, 0.25  # of its way, by which where it leads has changed since it began
 BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch of the sole
 FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
@@ -75,6 +79,8 @@ class Swings:
     """rad, the lowest pitch of the sole in this swing."""
     travelled_ws: Float[Array, "legs 3"]
     """m, horizontal, from its last foothold to the ball; in a stance, by how far it slides."""
+    first_way_ws: Float[Array, "legs 3"]
+    """m, horizontal, from its last foothold to the next, as foreseen when it last stood."""
     from_root_ws: Float[Array, "legs 3"]
     """m, from the character's root to each animated ball, in the frame before."""
     velocity_ws: Float[Array, "3"]
@@ -85,7 +91,7 @@ def no_swings(rig: Rig) -> Swings:
     """Memory before the first frame."""
     zero = jnp.zeros_like(rig.side)
     offset = jnp.zeros((*zero.shape, 3), zero.dtype)
-    return Swings(zero, zero, zero, zero, zero, zero, offset, offset, offset[0])
+    return Swings(zero, zero, zero, zero, zero, zero, offset, offset, offset, offset[0])
 
 
 @struct
@@ -137,9 +143,27 @@ class PlannedStride(Stride):
     """s, until the foot lands; 0 while it stands."""
 
 
-def sureness(fraction: Array) -> Float[Array, "*b"]:
-    """0..1, how sure it is where a swing lands of which this fraction has passed."""
+def sureness(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, " legs"]:
+    """0..1, how sure it is where each swing leads: late in it, or if that has hardly changed.
+
+    Of people on uneven ground, feet land 15 to 20 cm from where half of their swing leads; on a
+    walk that goes on as it is, 3 cm, and it has led there all the time.
+
+    Args:
+        feet: what the frame shows.
+        swings: how far the feet are.
+        next_ws: where each will stand next, m, world space.
+    """
+    way = _way(feet, swings, next_ws)
+    change = vec.safe_divide(vec.length(way - swings.first_way_ws), vec.length(way))
+    other = smoothing.smoothstep((change - AS_FORESEEN) / (OTHERWISE - AS_FORESEEN))
+    fraction = swings.fraction + EARLIER * swings.whole * (1.0 - other)
     return smoothing.smoothstep((fraction - UNSURE) / (SURE - UNSURE))
+
+
+def _way(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, "legs 3"]:
+    """From the last foothold of each foot to the next, m, horizontal."""
+    return vec.reject(next_ws - feet.ball_ws, feet.up_ws) + swings.travelled_ws
 
 
 def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
@@ -261,11 +285,14 @@ def follow_swings(
         gate.choose(feet.planted, jnp.ones_like(time), before.whole),
         gate.choose(feet.planted, feet.pitch, lowest),
         gate.choose(feet.planted[:, None], in_stance, travelled),
+        before.first_way_ws,
         feet.from_root_ws,
         velocity,
     )
     foot_velocity = vec.scale(moved, vec.safe_divide(jnp.ones_like(dt), dt))
-    return swings, _landing(feet, swings, foot_velocity, stance_time, swing_time)
+    next_ws = _landing(feet, swings, foot_velocity, stance_time, swing_time)
+    way = gate.choose(feet.planted[:, None], _way(feet, swings, next_ws), before.first_way_ws)
+    return dataclasses.replace(swings, first_way_ws=way), next_ws
 
 
 def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: AbstractGate) -> Instant:

@@ -129,8 +129,8 @@ class StrideProbe(AbstractSupportedProbe):
         sure = jnp.zeros_like(until)
         if self.slide_to_support:
             place_ws = jnp.where(swings.planted[:, None] > 0.5, last_ws, next_ws)
-            sure = foresight.sureness(swings.fraction)
-            plan = self._plan(now, watched, place_ws, state, swings, until)
+            sure = foresight.sureness(watched, swings, next_ws)
+            plan = self._plan(now, watched, place_ws, state, swings, sure, until)
             last_ws += plan.last_ws
             next_ws += vec.scale(watched.ahead_ws, plan.slide)
         animated = watched.frame.stride
@@ -151,6 +151,7 @@ class StrideProbe(AbstractSupportedProbe):
         place_ws: Array,
         before: foresight.Foresight,
         swings: foresight.Swings,
+        sure: Array,
         until: Array,
     ) -> foresight.Plan:
         """Where each foot will stand; late in its swing it keeps to the tread that it goes to.
@@ -161,6 +162,7 @@ class StrideProbe(AbstractSupportedProbe):
             place_ws: where the ball of each foot would stand, m.
             before: memory.
             swings: how far the feet are.
+            sure: 0..1, how sure it is where swings lead.
             until: s, until they land.
         """
         inputs = Inputs(feet.rig, now.terrain, feet.frame, now.gate)
@@ -168,7 +170,7 @@ class StrideProbe(AbstractSupportedProbe):
         planted, stood = swings.planted > 0.5, before.swings.planted > 0.5
         swings_on, lands = now.started & ~planted & ~stood, now.started & planted & ~stood
         origin = vec.dot(level.origin_ws, level.up_ws)
-        sure = jnp.where(planted, 1.0, foresight.sureness(swings.fraction))
+        sure = jnp.where(planted, 1.0, sure)
         tread = Tread(plan.height - origin, jnp.where(swings_on, STAYS * sure, 0.0))
         supports = self.better_support(
             inputs,

@@ -27,6 +27,7 @@ SLIDE_COST = 0.15  # of the sole that a slide by the whole of it has to gain
 AHEAD = 0.1  # tenths of the sole, by which a place ahead counts as nearer: no two are equal
 TOO_FAR = 6.0  # of the sole, more than any slide gains
 FIFTH = 0.2  # of the sole, over which slides become too far
+AT_EDGE = 0.3  # of the sole, that a ball at an edge counts as: a predicted foothold is not exact
 SHARE_BAND = 0.01  # of the sole
 SAME_TREAD = 0.02  # m, from the height of a tread, within which ground is that tread
 
@@ -63,6 +64,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
     plane, as the stair behind a heel does, counts against the foot four times: on captured people a
     third of a sole hangs over an edge at times, but nothing cuts into it.
 
+    A foot that is sent to a predicted foothold keeps its ball off edges by a tenth of its sole.
     Footholds that are predicted from a single frame stay: they are off by as much as a slide. In a
     swing the slide goes from that of the last foothold to that of the next.
     """
@@ -142,14 +144,18 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             return values[first : first + len(SLIDES)]
 
         share, blocked = jnp.zeros_like(at(heights)), jnp.zeros_like(at(heights))
+        inside = jnp.ones_like(share)
         climbs = climb(at(line.normal), vec.scale(ahead_ws, tenth), up)
         for point in map(int, SOLE):
             above = at(heights, point) - at(heights) - climbs * point
             above *= vec.safe_divide(at(line.found, point), sole)
             block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
             hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
-            share += at(line.found, point) * (1.0 - block - hollow)
+            supported = at(line.found, point) * (1.0 - block - hollow)
+            share += supported
             blocked += block
+            if abs(point) == 1:
+                inside *= supported
         share, blocked = share / len(SOLE), blocked / len(SOLE)
         slide = jnp.asarray(tenths, tenth.dtype) * tenth + jnp.zeros_like(share)
         lack = self.min_sole - at(firm) * (share - BLOCKS * blocked)
@@ -161,6 +167,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             off = jnp.abs(at(heights) - tread.height)
             elsewhere = smoothstep((off - SAME_TREAD) / SAME_TREAD)
             cost += tread.preferred * (1.0 - at(firm) * (1.0 - elsewhere))
+            cost += AT_EDGE * (1.0 - inside)
         places = cost, slide, at(firm) * share, at(heights)
 
         def cheaper(nearer: tuple[Array, ...], farther: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -26,6 +26,7 @@ class Swing:
     further: float
     whole: bool
     travelled: Array
+    first_way: Array
     ball_from_root: Array
     velocity: Array
 
@@ -82,7 +83,9 @@ def follow(
             travelled = travelled * (1.0 - smooth01((length(travelled) - 0.04) / 0.04))
         travelled = travelled * (1.0 - maths.fraction_of_half_life(0.3, dt))
         time, fraction, lowest, further, whole = 0.0, 0.0, pitch, 0.0, True
-    swing = Swing(planted, time, fraction, lowest, further, whole, travelled, from_root, smooth)
+    swing = Swing(
+        planted, time, fraction, lowest, further, whole, travelled, np.zeros(3), from_root, smooth
+    )
     fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
     by_hip = hip + smooth * ((1.0 - fraction) * lasts + 0.5 * stance)
@@ -90,7 +93,22 @@ def follow(
     covered = 10 * x**3 - 15 * x**4 + 6 * x**5
     speed = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time
     by_ball = ball + moved / dt * lasts * (1.0 - covered) / speed
-    return swing, ball - travelled, by_hip + smooth01((fraction - 0.3) / 0.4) * (by_ball - by_hip)
+    last = ball - travelled
+    following = by_hip + smooth01((fraction - 0.3) / 0.4) * (by_ball - by_hip)
+    if planted:
+        swing.first_way = across(following - last, up)
+    elif before is not None:
+        swing.first_way = before.first_way
+    return swing, last, following
+
+
+def sureness(swing: Swing, way: Array) -> float:
+    """How sure a swing is to lead there, level from its last foothold."""
+    if length(way) == 0.0:
+        return 0.0
+    changed = smooth01((length(way - swing.first_way) / length(way) - 0.1) / 0.15)
+    earlier = 0.24 * (1.0 - changed) if swing.whole else 0.0
+    return smooth01((swing.fraction + earlier - 0.7) / 0.18)
 
 
 def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
