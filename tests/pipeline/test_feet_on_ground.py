@@ -44,7 +44,7 @@ def solve(preset: str, rig: jaxik.Rig, frames: jaxik.Frame) -> jaxik.Result:
 
 @functools.cache
 def captured(path: Path) -> Clip:
-    """The first four seconds; a shorter clip goes to and fro, since in a pause any foot may lock."""
+    """The first four seconds; a shorter clip goes to and fro: in a pause any foot may lock."""
     clip = resample(without_t_pose(load_clip(path)), FPS)
     clip = dataclasses.replace(clip, stance=clip.stance_labels())
     last = clip.frame_count - 1
