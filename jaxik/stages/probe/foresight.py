@@ -144,7 +144,7 @@ class PlannedStride(Stride):
 
 
 def sureness(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, " legs"]:
-    """0..1, how sure it is where each swing leads: late in it, or if that has hardly changed.
+    """0..1, how sure it is where swings lead: late in them, earlier if that has hardly changed.
 
     Of people on uneven ground, feet land 15 to 20 cm from where half of their swing leads; on a
     walk that goes on as it is, 3 cm, and it has led there all the time.

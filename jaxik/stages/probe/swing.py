@@ -21,7 +21,6 @@ SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0
 # When a swing changes most, as a fraction of it: measured on people who walk over blocks.
 HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
 TOES_UP, TOES_DOWN = 0.23, 0.75
-HIGHEST_OVER = 0.175  # m over both footholds, the highest that they went over
 ON_HEEL = 0.08  # rad, toes up, from which a foot of the animation is on its heel
 
 
@@ -68,8 +67,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape was read off a
     captured walk over blocks; where the ground is as even as in the animation nothing is added.
     Steps higher than `highest_step`, the highest of that walk, add no more than it does: several
-    stairs at once are no reason to lift a foot far above them. Nor does it pass over an obstacle
-    at a greater distance than over the highest of that walk.
+    stairs at once are no reason to lift a foot far above them. Nor does a foot pass over what is
+    higher than `highest_over` at a greater distance.
     """
 
     clearance: Leaf = length(
@@ -141,6 +140,9 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     highest_step: Leaf = constant(
         0.3, "Height of a step up or down, beyond which a higher one adds no more.", unit="m"
     )
+    highest_over: Leaf = constant(
+        0.175, "Height over both footholds, from which a foot passes no further above.", unit="m"
+    )
 
     def swing(
         self,
@@ -165,7 +167,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         """
         x = stride.fraction
         rise, fall = self._height_of_step(step), self._height_of_step(-step)
-        low_over = jnp.where(over < HIGHEST_OVER, over, HIGHEST_OVER)
+        low_over = jnp.where(over < self.highest_over, over, self.highest_over)
         total = rise + fall + low_over
         uneven = smoothstep(total / self.uneven_height)
         lift = uneven * (
