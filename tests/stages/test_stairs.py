@@ -33,7 +33,7 @@ def test_they_do_so_on_rubble_curbs_ledges_and_ramps():
 
 @pytest.mark.slow
 def test_feet_stand_on_treads_that_nothing_foretells():
-    """From the first stride on; in one swing of eight they bend more, in one of forty they dip."""
+    """From the first stride on; one walk of eight bends more, one of forty dips."""
     rng = np.random.default_rng(0)
     chosen = [sample(rng, field=True) for _ in range(500)]
     pairs = walked(jaxik.presets.stride(foretold=False), chosen, known=False)
