@@ -1,6 +1,7 @@
 """Footholds that nothing foretells: predicted from each swing so far, and from no later frame."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -126,26 +127,33 @@ def flickering(frame: characters.Frame, n: int) -> characters.Frame:
     return dataclasses.replace(frame, stride=dataclasses.replace(frame.stride, standing=standing))
 
 
+def by_reference(
+    frames: list[characters.Frame], times: dict[str, float]
+) -> Iterator[tuple[tuple[int, int], reference.Swing, np.ndarray, np.ndarray]]:
+    """For each frame and leg the memory after it, and the last and the next foothold."""
+    for leg in range(2):
+        before = None
+        for n, frame in enumerate(frames):
+            planted, up = bool(frame.stride.standing[leg] > 0.5), reference.maths.Y
+            before, last, following = reference.follow(times, RIG, frame, leg, planted, up, before)
+            yield (n, leg), before, last, following
+
+
 def test_memory_agrees_with_the_reference():
     """Also where a foot hardly leaves its foothold, while contact flickers."""
     frames = walk(RIG, COUNT, start=START, heading=0.3)
     frames = [flickering(frame, n) for n, frame in enumerate(frames)]
-    values = {"probe.stance_time": 0.6, "probe.swing_time": 0.4}
-    ik = parameter_tree.replace(AS_PREDICTED, values)
+    times = {"probe.stance_time": 0.6, "probe.swing_time": 0.4}
+    ik = parameter_tree.replace(AS_PREDICTED, times)
     memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
     swings = memory.swings
-    up = reference.maths.Y
-    for leg in range(2):
-        before = None
-        for n, frame in enumerate(frames):
-            planted = bool(frame.stride.standing[leg] > 0.5)
-            before, last, following = reference.follow(values, RIG, frame, leg, planted, up, before)
-            assert float(swings.fraction[n, leg]) == pytest.approx(before.fraction, abs=1e-9)
-            assert float(swings.time[n, leg]) == pytest.approx(before.time, abs=1e-9)
-            assert float(swings.further[n, leg]) == pytest.approx(before.further, abs=1e-9)
-            first = swings.first_way_ws, before.first_way
-            for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
-                np.testing.assert_allclose(got[n, leg, [0, 2]], wanted[[0, 2]], atol=1e-9)
+    for at_leg, swing, last, following in by_reference(frames, times):
+        assert float(swings.fraction[at_leg]) == pytest.approx(swing.fraction, abs=1e-9)
+        assert float(swings.time[at_leg]) == pytest.approx(swing.time, abs=1e-9)
+        assert float(swings.further[at_leg]) == pytest.approx(swing.further, abs=1e-9)
+        first = swings.first_way_ws, swing.first_way
+        for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
+            np.testing.assert_allclose(got[at_leg][[0, 2]], wanted[[0, 2]], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -165,17 +173,12 @@ def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
 @pytest.mark.slow
 def test_how_sure_a_swing_is_of_its_foothold_agrees_with_the_reference():
     """On a walk whose swings lead elsewhere by up to a third of their way."""
-    frames, values = walk(RIG, COUNT, start=START), {"probe.stance_time": 0.65}
-    values["probe.swing_time"] = 0.45
+    frames = walk(RIG, COUNT, start=START)
     sure = np.asarray(foreseen(PREDICTED, to_frames(frames))[1].sure)
-    up = reference.maths.Y
-    for leg in range(2):
-        before = None
-        for n, frame in enumerate(frames):
-            planted = bool(frame.stride.standing[leg] > 0.5)
-            before, last, following = reference.follow(values, RIG, frame, leg, planted, up, before)
-            way = reference.across(following - last, up)
-            assert float(sure[n, leg]) == pytest.approx(reference.sureness(before, way), abs=1e-6)
+    times = {"probe.stance_time": 0.65, "probe.swing_time": 0.45}
+    for at_leg, swing, last, following in by_reference(frames, times):
+        way = reference.across(following - last, reference.maths.Y)
+        assert float(sure[at_leg]) == pytest.approx(reference.sureness(swing, way), abs=1e-6)
     assert ((sure > 0.05) & (sure < 0.95)).sum() > 5
 
 
