@@ -27,7 +27,7 @@ SLIDE_COST = 0.15  # of the sole that a slide by the whole of it has to gain
 AHEAD = 0.1  # tenths of the sole, by which a place ahead counts as nearer: no two are equal
 TOO_FAR = 6.0  # of the sole, more than any slide gains
 FIFTH = 0.2  # of the sole, over which slides become too far
-AT_EDGE = 0.3  # of the sole, that a ball at an edge counts as: a predicted foothold is not exact
+AT_EDGE = 0.3  # of the sole, that a place costs whose ball is at an edge: predictions are not exact
 SHARE_BAND = 0.01  # of the sole
 SAME_TREAD = 0.02  # m, from the height of a tread, within which ground is that tread
 
