@@ -70,7 +70,12 @@ def barrier(x: Array) -> Array:
 
 
 def stacked_barrier(*values: Array) -> tuple[Array, ...]:
-    """Scalars (angles, cosines, lengths) broadcast, then stacked behind one `barrier`."""
+    """Scalars (angles, cosines, lengths) broadcast, then stacked behind one `barrier`.
+
+    A stack is differentiated as a whole, so a value whose derivative nobody needs is better alone.
+    """
+    if len(values) == 1:
+        return stacked_barrier(*values, jnp.zeros_like(values[0]))[:1]
     return unstack(barrier(stack(*values)))
 
 

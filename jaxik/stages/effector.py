@@ -126,6 +126,7 @@ class HeelEffector(AbstractEffector):
         to_ankle = target.pos - hip
         ahead = vec.safe_divide(vec.dot(to_ankle, sensed.ahead_ws), vec.length(to_ankle))
         angle *= 1.0 - smoothing.smoothstep((ahead - RISES) / (STAYS - RISES))
+        (angle,) = vec.stacked_barrier(angle)
         raised = quat.rotate(quat.from_axis_angle(tilted_axis, -angle), arm)
         # The foot rule tilts the foot once it is raised.
         rot_ws = quat.multiply(quat.from_axis_angle(axis, -angle), target.rot)
@@ -159,6 +160,7 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
     constant = vec.dot(start, start) + vec.dot(across, across)
     cos_part = 2.0 * vec.dot(start, across)
     sin_part = 2.0 * vec.dot(start, vec.cross(across, axis))
+    constant, cos_part, sin_part = vec.stacked_barrier(constant, cos_part, sin_part)
     size = vec.safe_sqrt(cos_part**2 + sin_part**2)
     shortens = sin_part < 0
     cosine = vec.safe_divide(length**2 - constant, size)

@@ -257,7 +257,7 @@ class ReachPelvis(AbstractFollowingPelvis):
         ) -> Array:
             later = limits(hip_ws, landing_ws, wanted) + self.softness * ends.lateness
             heights = limits(hip_ws, ankle_ws, wanted)
-            heights = vec.stack(*vec.unstack(heights), *vec.unstack(later), wanted)
+            heights = vec.barrier(vec.stack(*vec.unstack(heights), *vec.unstack(later), wanted))
             lowest, shares = self._lowest(heights, weights)
             return lowest - self.softness * jnp.log(vec.sum_last(shares))
 
@@ -265,12 +265,13 @@ class ReachPelvis(AbstractFollowingPelvis):
         ahead = limiting_ahead(hip_ws, target.pos) - limiting_ahead(sensed.hip_ws, animated_ws)
         ahead *= self.shift
         ahead *= vec.safe_divide(self.most_shift, vec.safe_sqrt(self.most_shift**2 + ahead**2))
+        ahead, wanted = vec.stacked_barrier(ahead, wanted)
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
         level_ws = animated_ws + ends.way_ws
         landing_ws = target.pos + ends.way_ws + vec.scale(sensed.leg_up_ws, ends.rise)
         animated = reachable_height(sensed.hip_ws, animated_ws, level_ws, jnp.zeros_like(wanted))
         moved = reachable_height(shifted_ws, target.pos, landing_ws, wanted)
-        return Goal(moved - animated, ahead)
+        return Goal(*vec.stacked_barrier(moved - animated, ahead))
 
     def _lowest(self, limits: Array, weights: Array) -> tuple[Array, Array]:
         """The lowest of limits, m, and how far each of them, of these weights, is the lowest."""

@@ -105,12 +105,12 @@ def with_weight(hit: Hit, found: Array) -> Hit:
 def mixed(hit: Hit, other: Hit, up_ws: Array) -> Hit:
     """Both hits, each by how far it is found; these weights add up to at most 1."""
     found = hit.found + other.found
-    share = vec.safe_divide(other.found, found)
+    found, share = vec.stacked_barrier(found, vec.safe_divide(other.found, found))
     platform = None
     if hit.platform is not None and other.platform is not None:
         platform = jnp.where(share > 0.5, other.platform, hit.platform)
     return Hit(
-        lerp(hit.point, other.point, share[..., None]),
+        vec.add(hit.point, vec.scale(other.point - hit.point, share)),
         vec.normalize(lerp(hit.normal, other.normal, share[..., None]), up_ws),
         lerp(hit.distance, other.distance, share),
         found,

@@ -147,9 +147,10 @@ class AbstractLimitedProbe(AbstractProbe):
         first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
         # Ground that is refused for its slope may be hit by both rays.
         lies_below = below.distance + above > first.distance + SAME_GROUND
-        lower = jnp.where(lies_below, (1.0 - accepted[0]) * accepted[1], 0.0)
+        upper, lower = vec.stacked_barrier(*accepted)
+        lower = jnp.where(lies_below, (1.0 - upper) * lower, 0.0)
         below = dataclasses.replace(below, distance=below.distance + above, found=lower)
-        return mixed(with_weight(first, accepted[0]), below, up)
+        return mixed(with_weight(first, upper), below, up)
 
     def cast_over_gaps(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
         """What carries feet below these points: `cast`, or the lower side of a narrow gap.
@@ -210,7 +211,7 @@ class AbstractLimitedProbe(AbstractProbe):
         way = hits.point - origin_ws
         rise = vec.dot(way, up_ws)
         slope = least_rise(rise, climb(hits.normal, way, up_ws))
-        step = rise - slope
+        (step,) = vec.stacked_barrier(rise - slope)
         step -= jnp.where(step > margin, margin, jnp.where(step < -margin, -margin, step))
         return self.trust(step, hits.normal, up_ws)
 
@@ -242,6 +243,7 @@ def climb(normal: Array, way: Array, up_ws: Array) -> Float[Array, "*b"]:
 def least_rise(*rises: Array) -> Array:
     """The rise nearest to 0, or 0 if some go up and others down, m."""
     # Not `jnp.minimum`: on a plane all are equal, and its derivative would add up several of them.
+    rises = vec.stacked_barrier(*rises)
     lowest = functools.reduce(lambda a, b: jnp.where(a < b, a, b), rises)
     highest = functools.reduce(lambda a, b: jnp.where(a > b, a, b), rises)
     return jnp.where(lowest > 0, lowest, jnp.where(highest < 0, highest, 0.0))

@@ -274,18 +274,22 @@ class StrideProbe(AbstractSupportedProbe):
         found = lerp(last.found, next_.found, fraction)  # a foot that stands has no other ground
         # Without a last foothold, the ground is that of the next, or without that the root's level.
         low = lerp(next_.found * high, low, last.found)
+        low, high, fraction, found = vec.stacked_barrier(low, high, fraction, found)
         normal = lerp(next_.normal, last.normal, last.found[..., None])
 
         way = vec.reject(way_ws, level.up_ws)
         climbs = self.climb(normal, way, level.up_ws), self.climb(next_.normal, way, level.up_ws)
-        slope = least_rise(high - low, *climbs)
+        (slope,) = vec.stacked_barrier(least_rise(high - low, *climbs))
         step = high - low - slope
         evened = jnp.concatenate([low[None], heights[1:]]) - slope * fractions
+        (evened,) = vec.stacked_barrier(evened)
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
         trust *= 1.0 - smoothstep(_least_step(evened, path.found, self.excess) / self.step_fade)
+        step, trust = vec.stacked_barrier(step, trust)
 
         covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
         height = low + trust * (slope * clip_to_one(covered) + step * fraction)
+        (height,) = vec.stacked_barrier(height)
         normal += vec.scale(next_.normal - normal, trust * fraction)
         normal = vec.normalize(normal, level.up_ws)
 
@@ -297,6 +301,7 @@ class StrideProbe(AbstractSupportedProbe):
         stair = _least_step(evened, path.found, jnp.abs)
         step = jnp.where(step > stair, stair, jnp.where(step < -stair, -stair, step))
         ahead = self.above_others(inputs, high - slope, height, found)
+        step, ahead, over, edge, below = vec.stacked_barrier(step, ahead, over, edge, below)
         swing = self.swing(inputs, stride, step, ahead, over, trust, below)
         height += self.clearance_over_edges(inputs, stride, swing, foot_height, edge)
         share = trust * fraction
@@ -306,7 +311,7 @@ class StrideProbe(AbstractSupportedProbe):
         # The ground under the ball may be a small piece; the heel stands on what is below it.
         plane_rise = self.climb(normal, arm, level.up_ws)
         rise = lerp(plane_rise, least_rise(plane_rise, heel_rise), jnp.sum(parts, 0))
-        height += rise
+        height, rise, plane_rise = vec.stacked_barrier(height + rise, rise, plane_rise)
         normal = _tilted(normal, arm, rise, level.up_ws)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
@@ -412,7 +417,7 @@ def _least_step(
         steps = size(heights[point] - heights[:point])
         reached = (jnp.where(a > b, a, b) for a, b in zip(highest, steps, strict=True))
         least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
-        highest.append(jnp.where(found[point] > 0, least, FAR))
+        highest += vec.stacked_barrier(jnp.where(found[point] > 0, least, FAR))
     return highest[-1]
 
 

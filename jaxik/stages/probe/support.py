@@ -134,6 +134,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         line = cast(inputs.terrain, starts, reach + jnp.zeros_like(starts[..., 0]), self.layers)
         heights = level.height(line.point)  # (points ends legs)
         firm = line.found * self.trust_from(level.origin_ws, line, up, margin)
+        heights, firm = vec.stacked_barrier(heights, firm)
 
         # All places in one array: one after another they made the program of `stride` 40 % longer.
         tenths = np.sort(SLIDES)[:, None, None]
@@ -156,6 +157,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             blocked += block
             if abs(point) == 1:
                 inside *= supported
+        (share,) = vec.stacked_barrier(share)
         share, blocked = share / len(SOLE), blocked / len(SOLE)
         slide = jnp.asarray(tenths, tenth.dtype) * tenth + jnp.zeros_like(share)
         lack = self.min_sole - at(firm) * (share - BLOCKS * blocked)
@@ -168,6 +170,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             elsewhere = smoothstep((off - SAME_TREAD) / SAME_TREAD)
             cost += tread.preferred * (1.0 - at(firm) * (1.0 - elsewhere))
             cost += AT_EDGE * (1.0 - inside)
+        (cost,) = vec.stacked_barrier(cost)
         places = cost, slide, at(firm) * share, at(heights)
 
         def cheaper(nearer: tuple[Array, ...], farther: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -169,7 +169,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         rise, fall = self._height_of_step(step), self._height_of_step(-step)
         low_over = jnp.where(over < self.highest_over, over, self.highest_over)
         total = rise + fall + low_over
-        uneven = smoothstep(total / self.uneven_height)
+        total, uneven = vec.stacked_barrier(total, smoothstep(total / self.uneven_height))
         lift = uneven * (
             self.toe_clearance * bump(x, CLEAR)
             - self.held_lift * self._animated_lift(inputs) * bump(x, HELD)
@@ -186,10 +186,11 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         pitch = share * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
         first = jnp.where(self.swing_as_animated, 0.0, self.toes_first)
         pitch -= first * below * smoothstep(self._toe_angle(inputs) / ON_HEEL)
+        lift, pitch = vec.stacked_barrier(share * lift, pitch)
         arm = animated_ankles(inputs.frame).pos - _balls(inputs)
         up = inputs.terrain.leg_up_ws
         turned = quat.rotate(pitch_rotation(inputs, pitch), arm)
-        return Swing(share * lift + vec.dot(turned - arm, up), pitch)
+        return Swing(lift + vec.dot(turned - arm, up), pitch)
 
     def _height_of_step(self, rise: Array) -> Array:
         """The height of a step that rises, m; 0 if it falls."""
