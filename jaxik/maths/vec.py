@@ -74,7 +74,7 @@ def stacked_barrier(*values: Array) -> tuple[Array, ...]:
 
     A stack is differentiated as a whole, so a value whose derivative nobody needs is better alone.
     """
-    if len(values) == 1:
+    if len(values) == 1:  # XLA drops a barrier before it fuses; what keeps a value apart is a stack
         return stacked_barrier(*values, jnp.zeros_like(values[0]))[:1]
     return unstack(barrier(stack(*values)))
 
