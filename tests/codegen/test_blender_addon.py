@@ -174,7 +174,7 @@ def test_in_blender_a_window_stays_alive_and_a_cancelled_bake_has_changed_nothin
     seen = answers["windowed"]
     assert seen["cancelled"] == [["CANCELLED"], "walk"]
     assert seen["ended"] == [["FINISHED"], "walk on ground"]
-    assert seen["steps"] > 2 and seen["longest"] < 0.5
+    assert seen["events"] > seen["frames"] / 2 > 10  # no event takes on more than two frames
 
 
 def test_in_blender_one_line_says_what_cannot_be_used(answers):

@@ -7,10 +7,10 @@ PYTHON has jaxik. Writes into the folder `<case>.npz` with the heads of bones be
 """
 
 import importlib
+import itertools
 import json
 import shutil
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -328,25 +328,26 @@ def windowed(bvh: str, ground: str, folder: Path) -> dict:
     """Baked step by step as in a window, at first cancelled."""
     rig, addon = scene_of(bvh, ground), importlib.import_module(ADDON)
     replay_solutions(folder)
-    seconds: list[float] = []
-    cancelled_at = [1]
+    first, last = rig.animation_data.action.frame_range
+    readings = itertools.count(0.0, addon.SHARE)  # a clock by which every step takes its share
+    addon.time = SimpleNamespace(perf_counter=readings.__next__)
+    events, cancelled_at = itertools.count(), [1]
 
     def execute(self, _):
         """What Blender does with an operator in a window, of which there is none here."""
         context = Context()
         result = self.invoke(context, None)
         while result <= {"RUNNING_MODAL", "PASS_THROUGH"}:
-            began = time.perf_counter()
-            kind = "ESC" if len(seconds) in cancelled_at else "TIMER"
+            kind = "ESC" if next(events) in cancelled_at else "TIMER"
             result = self.modal(context, SimpleNamespace(type=kind))
-            seconds.append(time.perf_counter() - began)
         return result
 
     addon.Job.execute = execute
     cancelled = [sorted(bpy.ops.jaxik.bake()), rig.animation_data.action.name, *rig.keys()]
     cancelled_at.clear()
     ended = [sorted(bpy.ops.jaxik.bake()), rig.animation_data.action.name]
-    return {"cancelled": cancelled, "ended": ended, "steps": len(seconds), "longest": max(seconds)}
+    frames = round(last) - round(first) + 1
+    return {"cancelled": cancelled, "ended": ended, "events": next(events), "frames": frames}
 
 
 def main(archive: str, bvh: str, ground: str, python: str, place: str) -> None:
