@@ -25,6 +25,7 @@ from jaxik.world.terrain import Terrain
 
 VISIBLE = 0.02  # m, from which a viewer notices a sole off its ground, a slide and a pop
 TICK = 1.0 / 60.0  # s, the time over which a pop is measured
+PELVIS = "pelvis"  # whose pops are those of the whole body
 STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
 LEVEL = 1e-3  # m, between the heights of ground that counts as a level floor
 MISSING = 0.5  # of the points of soles that may be without ground
@@ -50,6 +51,7 @@ class Extreme(NamedTuple):
     """m; NaN where there is nothing to measure."""
     frame: int
     leg: str
+    """Of a pop, it may be the pelvis."""
 
     def __str__(self) -> str:
         if math.isnan(self.value):
@@ -195,9 +197,9 @@ class Measures(Figures):
     )  # fmt: skip
     pop: float = declared(
         "pop", "cm in 1/60 s", 1,
-        "Largest change, over 1/60 s, of an ankle's correction: of its place relative to the "
-        "pelvis, less that of the animated one. Where frames are longer, the change over a frame "
-        "is scaled to 1/60 s.",
+        "Largest change, over 1/60 s, of a correction: of the pelvis's height, or of an ankle's "
+        "place relative to the pelvis, each less that of the animated one. Where frames are "
+        "longer, the change over a frame is scaled to 1/60 s.",
         bound=VISIBLE,
         reason="larger changes are seen, beyond what a smooth swing from one foothold to the next "
         "needs on this ground",
@@ -404,11 +406,11 @@ def measure(
         contact=_mean(~in_ground & ~above, stance & known),
         groundless=float(np.mean(np.isnan(feet.ground))),
         slide=float(np.median(known_slides)) if known_slides.size else math.nan,
-        foot_skating=_foot_skating(feet, solved, size),
-        pop=_extreme(speed, names).value,
-        pops=float(sum(len(contacts.runs(of_leg > visible)) for of_leg in speed.T)),
-        knee_jerk=jerk(knee_angle(hip, knee, ankle), solved.fps, solved.cuts),
-        pelvis_jerk=jerk(pelvis, solved.fps, solved.cuts),
+        foot_skating=_foot_skating(feet, solved, animated.cuts, size),
+        pop=_extreme(speed, (*names, PELVIS)).value,
+        pops=float(sum(len(contacts.runs(of_joint > visible)) for of_joint in speed.T)),
+        knee_jerk=jerk(knee_angle(hip, knee, ankle), solved.fps, animated.cuts),
+        pelvis_jerk=jerk(pelvis, solved.fps, animated.cuts),
         reached=math.nan if reached is None else _mean(reached, stance & ~np.isnan(reached)),
         straight=_mean(straight(hip, ankle, lengths), np.ones(stance.shape, bool)),
         lost_clearance=float(np.median(known_lost)) if known_lost.size else math.nan,
@@ -417,7 +419,7 @@ def measure(
             "floating": _extreme(standing, names),
             "contact": _extreme(np.abs(standing), names),
             "slide": _extreme(slides, names),
-            "pop": _extreme(speed, names),
+            "pop": _extreme(speed, (*names, PELVIS)),
             "lost_clearance": _extreme(lost, names),
         },
         size=size,
@@ -431,7 +433,7 @@ def travelled(
 
     NaN in swings.
     """
-    steps = horizontal_steps(motion.joints_ws(3), motion.cuts)
+    steps = horizontal_steps(motion.joints_ws(3), flat.cuts)
     steps = steps - horizontal_steps(flat.joints_ws(3), flat.cuts)
     path = np.full(stance.shape, np.nan)
     for leg in range(stance.shape[1]):
@@ -450,9 +452,9 @@ def _of_stances(path: Float64[np.ndarray, "frames legs"]) -> Float64[np.ndarray,
     return slides
 
 
-def _foot_skating(feet: Soles, solved: Clip, size: float) -> float:
+def _foot_skating(feet: Soles, solved: Clip, cuts: Sequence[int], size: float) -> float:
     """The foot-skating ratio over all steps from one frame to the next; NaN if none is known."""
-    height, steps = feet.height[..., 1], horizontal_steps(solved.joints_ws(3), solved.cuts)
+    height, steps = feet.height[..., 1], horizontal_steps(solved.joints_ws(3), cuts)
     in_contact = feet.stance & (height < CONTACT_HEIGHT * size)  # false for NaN
     known = ~np.isnan(height)
     skids = in_contact[1:] & in_contact[:-1] & (steps * solved.fps > SKID * size)
@@ -482,24 +484,24 @@ def horizontal_steps(
     return steps
 
 
-def _pops(solved: Clip, animated: Clip) -> Float64[np.ndarray, "frames legs"]:
-    """How fast the ankles' corrections relative to the pelvis change, m in a `TICK`.
+def _pops(solved: Clip, animated: Clip) -> Float64[np.ndarray, "frames legs+1"]:
+    """How fast corrections change, m in a `TICK`: of ankles relative to the pelvis, and its height.
 
     The change is taken over a tick, or over a frame where frames are longer. A steady change gives
     the same number at every frame rate. A jump gives its size at 60 Hz and its multiples, and half
     of it at 30 Hz, where it cannot be distinguished from a steady change within the frame. It
     stands at its last frame; NaN before it, and where a cut lies between.
     """
-    before, after = (
-        clip.joints_ws(2) - clip.positions_ws[:, clip.rig.pelvis][:, None]
-        for clip in (animated, solved)
+    (ankles, pelvis), (our_ankles, our_pelvis) = (
+        (clip.joints_ws(2), clip.positions_ws[:, [clip.rig.pelvis]]) for clip in (animated, solved)
     )
-    correction = after - before
+    moved = our_pelvis - pelvis
+    correction = np.concatenate([our_ankles - ankles - moved, moved * [0.0, 1.0, 0.0]], axis=1)
     frames = max(1, round(solved.fps * TICK))
     speed = np.full(correction.shape[:2], np.nan)
     change = np.linalg.norm(correction[frames:] - correction[:-frames], axis=-1)
     speed[frames:] = change * (solved.fps * TICK / frames)
-    for cut in solved.cuts:
+    for cut in animated.cuts:  # if the solved body jumps anywhere else, it pops
         speed[cut : cut + frames] = np.nan
     return speed
 

@@ -244,7 +244,8 @@ class Animation:
         if isinstance(ik.probe, StrideProbe) or not measured.pop > self.bounds["pop"]:
             return None
         first = max(0, frame - round(BEFORE_POP * motion.clip.fps))
-        before = slice(first, frame + 1), motion.clip.rig.names.index(leg)
+        legs = [leg in (name, measures.PELVIS) for name in motion.clip.rig.names]
+        before = slice(first, frame + 1), legs
         rise = np.nanmax(np.diff(motion.soles.ground[before], axis=0), initial=0.0)
         depth = float(np.nanmax(-motion.soles.gap[before], initial=0.0))
         return measures.Cause("late", depth) if min(rise, depth) > measured.visible else None

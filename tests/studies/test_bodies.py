@@ -231,6 +231,10 @@ def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_
     late = animation.cause(raised, accepting)
     assert late is not None and late.kind == "late" and late.amount < 0.45
     assert late.sentence.startswith("likely cause of the pop: rays met the step only once")
+    pelvis = {"pop": raised.measures.worst["pop"]._replace(leg=measures.PELVIS)}
+    body = replace(raised, measures=replace(raised.measures, worst=pelvis))
+    of_body = animation.cause(body, accepting)
+    assert of_body is not None and of_body.kind == "late" and of_body.amount >= late.amount
     assert animation.cause(raised) is None
     even = replace(raised.soles, ground=np.zeros_like(raised.soles.ground))
     assert animation.cause(replace(raised, soles=even), accepting) is None
