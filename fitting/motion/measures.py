@@ -589,6 +589,7 @@ CAUSES = {
     "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
     "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
+    "clip": "the clip's own soles are up to {1:.0f} cm off its floor while they stand",
     "limit": "the system refuses the ground: {3} is {4}, and feet stand on it with {5}",
     "off": "the system leaves {1:.0f} % of these feet as animated, as `unreal` does while the "
     "character moves",
@@ -602,7 +603,7 @@ class Cause(NamedTuple):
 
     kind: str
     amount: float = 0.0
-    """`offset`, `late`: m. `units`: metres for each unit of the terrain. `off`: 0..1, of the feet.
+    """`offset`, `clip`, `late`: m. `units`: metres for each unit of the terrain. `off`: 0..1.
     """
     limit: tuple[str, str, str] = ("", "", "")
     """`limit`: the parameter, its value, and one with which feet stand."""
@@ -635,8 +636,8 @@ def likely_cause(
     - `units`: the feet follow the ground by the factor of a unit of length.
     - `offset`: all feet are too high or too low by the same amount.
     - `root`: the higher the ground, the deeper they are in it.
-    - `unknown`: none of these; `limit`, `off` and `late`, causes in the system, are for those who
-      know that to find.
+    - `unknown`: none of these; `clip`, a cause in the clip on its floor, and `limit`, `off` and
+      `late`, causes in the system, are for those who know these to find.
 
     Args:
         feet: the soles of the animation.

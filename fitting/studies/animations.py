@@ -231,9 +231,21 @@ class Animation:
         unit = 1.0 if files is None else files.terrain_options.terrain_scale or 1.0
         soles = self.soles(animated)
         cause = measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+        if cause.kind == "unknown":
+            cause = self._own(motion) or cause
         if cause.kind == "unknown" and ik is not None:
             return self._binding_limit(motion, ik) or self._off(motion) or cause
         return cause
+
+    def _own(self, motion: measures.PlacedMotion) -> measures.Cause | None:
+        """That most of the feet that stand off the ground are off the clip's own floor alike."""
+        gap = motion.soles.gap
+        own = measures.sole_points(self.clip)[..., 1].min(axis=-1) - self.floor
+        off = motion.soles.stance & (np.abs(gap) > motion.measures.visible)
+        kept = off & (np.abs(own - gap) < 0.5 * np.abs(gap))
+        if kept.sum() <= 0.5 * off.sum():
+            return None
+        return measures.Cause("clip", float(np.abs(own[kept]).max()))
 
     def _late(self, motion: measures.PlacedMotion, ik: jaxik.FootIK) -> measures.Cause | None:
         """That a foot pops out of a step that it met inside, where the system does not look ahead.

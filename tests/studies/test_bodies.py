@@ -13,7 +13,7 @@ import pytest
 
 import jaxik
 from fitting.clips import Clip, edit, load_clip, save_clip
-from fitting.clips.clip_frames import clip_from_result, frames_from_clip
+from fitting.clips.clip_frames import clip_from_result, frames_from_clip, raised
 from fitting.experiment import parameter_files, systems
 from fitting.experiment.experiment_files import load_experiment
 from fitting.experiment.problems import make_problem
@@ -206,6 +206,15 @@ def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
     assert placed.measures.misplaced and placed.measures.penetration > 0.5
     cause = animation.cause(placed)
     assert cause is not None and cause.kind == "root"
+
+
+@pytest.mark.parametrize("heights", [(0.0, 0.5), (-0.04, 0.0)])
+def test_a_clip_whose_feet_are_off_its_own_floor_is_named_as_the_cause(on_a_floor, heights):
+    uneven = raised(on_a_floor, np.linspace(*heights, on_a_floor.frame_count))
+    animation = Animation(uneven, terrain.plane())
+    cause = animation.cause(animation.place(uneven), presets.stride())
+    assert cause is not None and cause.kind == "clip"
+    assert cause.amount == pytest.approx(max(np.abs(heights)), abs=0.02)
 
 
 def test_the_limit_that_refuses_a_step_is_named_with_a_value_that_accepts_it(on_a_floor):
