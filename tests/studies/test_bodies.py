@@ -200,6 +200,16 @@ def test_the_root_rises_without_pops_on_a_hill_and_on_stairs(on_a_floor):
         assert np.abs(np.diff(root.rise)).max() < 0.02 and root.rise.max() > 0.5
 
 
+@pytest.mark.slow
+def test_a_body_that_starts_to_walk_down_sinks_gradually():
+    clip = load_clip(CLIPS / "stop_and_go_base.npz").select(slice(90, 150))  # stands until 115
+    ball, landing = clip.joints_ws(3)[:, 1, 2], 135 - 90
+    animation = Animation(clip, terrain_of(flight([ball[landing] - 0.18], rise=-0.18)))
+    solved = animation.solve(presets.stride())[1]
+    sunk = (clip.positions_ws - solved.positions_ws)[:, clip.rig.pelvis, 1]
+    assert np.diff(sunk).max() < 0.03 and sunk.max() > 0.1  # m in 1/30 s
+
+
 def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
     animation = Animation(on_a_floor, terrain_of(hill()), root=AS_ANIMATED)
     placed = animation.place(on_a_floor)

@@ -151,7 +151,9 @@ class ReachPelvis(AbstractFollowingPelvis):
     A foot that will land lower needs the body lower as soon as it does. So within about
     `landing_time` a swinging leg's limit passes to that at its next foothold, where the body will
     be then: the limit there, higher by `k (t / landing_time)^2`, `t` before. The time that is left
-    follows from how much of the swing passes in a frame, so footholds have to be known.
+    follows from how much of the swing passes in a frame, so footholds have to be known. Where the
+    body will be follows from how fast it goes: if it is to speed up first, it seems to stay too far
+    behind, and a drop counts only as far as the animated leg is seen to reach.
 
     The body also moves forward or back towards the foot whose leg limits it, the lower of two: by
     `shift` of how much further ahead of its hip that foot is than in the animation. People stay
@@ -268,7 +270,12 @@ class ReachPelvis(AbstractFollowingPelvis):
         ahead, wanted = vec.stacked_barrier(ahead, wanted)
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
         level_ws = animated_ws + ends.way_ws
-        landing_ws = target.pos + ends.way_ws + vec.scale(sensed.leg_up_ws, ends.rise)
+        # Else one who starts to walk down would drop at once.
+        straight = rise_to_length(sensed, sensed.hip_ws, level_ws, sensed.thigh + sensed.shin)
+        missed = jnp.where(straight < 0, -straight, 0.0)
+        below = jnp.where(ends.rise < -missed, ends.rise + missed, 0.0)
+        rise = jnp.where(ends.rise < 0, below, ends.rise)
+        landing_ws = target.pos + ends.way_ws + vec.scale(sensed.leg_up_ws, rise)
         animated = reachable_height(sensed.hip_ws, animated_ws, level_ws, jnp.zeros_like(wanted))
         moved = reachable_height(shifted_ws, target.pos, landing_ws, wanted)
         return Goal(*vec.stacked_barrier(moved - animated, ahead))

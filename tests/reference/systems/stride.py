@@ -329,7 +329,7 @@ def reach_goal(
     animated = [foot.pos_ws("ankle") - foot.pos_ws("hip") for foot in feet]
     moved = [target - hip for target, hip in zip(targets, hips, strict=True)]
 
-    def highest_hips(to_feet: list[Array]) -> Array:
+    def highest_hips(to_feet: list[Array], longest: list[float] = longest) -> Array:
         """How far each hip may rise, m, until its leg is as long as it may be."""
         rises = (
             float(way @ up)
@@ -362,10 +362,11 @@ def reach_goal(
     ahead = parameters["pelvis.shift"] * (limiting_ahead(moved) - limiting_ahead(animated))
     ahead /= math.hypot(1.0, ahead / parameters["pelvis.most_shift"])
     shifted = [way - ahead * forward for way in moved]
-    landed = [
-        way + end.way + end.rise * foot.up
-        for way, end, foot in zip(shifted, ends, feet, strict=True)
-    ]
     level = [way + end.way for way, end in zip(animated, ends, strict=True)]
+    missed = np.maximum(0.0, -highest_hips(level, [foot.length for foot in feet]))
+    landed = [
+        way + end.way + max(end.rise, min(end.rise + miss, 0.0)) * foot.up
+        for way, end, foot, miss in zip(shifted, ends, feet, missed, strict=True)
+    ]
     height = reachable(highest_hips(shifted), highest_hips(landed), wanted)
     return height - reachable(highest_hips(animated), highest_hips(level), 0.0), ahead
