@@ -270,7 +270,7 @@ class ReachPelvis(AbstractFollowingPelvis):
         ahead, wanted = vec.stacked_barrier(ahead, wanted)
         shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
         level_ws = animated_ws + ends.way_ws
-        # Else one who starts to walk down would drop at once.
+        # Without this, the body of one who starts to walk down would drop at once.
         straight = rise_to_length(sensed, sensed.hip_ws, level_ws, sensed.thigh + sensed.shin)
         missed = jnp.where(straight < 0, -straight, 0.0)
         below = jnp.where(ends.rise < -missed, ends.rise + missed, 0.0)
