@@ -13,6 +13,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import bpy  # pyright: ignore[reportMissingImports]
@@ -326,7 +327,8 @@ class Context:
 
 def windowed(bvh: str, ground: str, folder: Path) -> dict:
     """Baked step by step as in a window, at first cancelled."""
-    rig, addon = scene_of(bvh, ground), importlib.import_module(ADDON)
+    rig = scene_of(bvh, ground)
+    addon: Any = importlib.import_module(ADDON)
     replay_solutions(folder)
     first, last = rig.animation_data.action.frame_range
     readings = itertools.count(0.0, addon.SHARE)  # a clock by which every step takes its share
