@@ -232,12 +232,12 @@ class Animation:
         soles = self.soles(animated)
         cause = measures.likely_cause(soles, animated, unit=unit, trial=self._soles_without)
         if cause.kind == "unknown":
-            cause = self._own(motion) or cause
+            cause = self._off_own_floor(motion) or cause
         if cause.kind == "unknown" and ik is not None:
             return self._binding_limit(motion, ik) or self._off(motion) or cause
         return cause
 
-    def _own(self, motion: measures.PlacedMotion) -> measures.Cause | None:
+    def _off_own_floor(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """That most of the feet that stand off the ground are off the clip's own floor alike."""
         gap = motion.soles.gap
         own = measures.sole_points(self.clip)[..., 1].min(axis=-1) - self.floor
