@@ -6,6 +6,7 @@ stride in both directions of time, so that it climbs stairs as evenly as a ramp 
 nothing. Distances are for an adult; others' are as their legs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -98,7 +99,7 @@ def place_root(
 
 
 def path_heights(
-    clip: Clip, terrain: Terrain, floor: float = 0.0
+    clip: Clip, terrain: Terrain, floor: float = 0.0, pieces: Sequence[slice] | None = None
 ) -> Float64[np.ndarray, " frames"] | None:
     """Height of the ground below the pelvis in each frame, m; None with less than `GROUND` of it.
 
@@ -110,6 +111,7 @@ def path_heights(
         clip: y up.
         terrain: y up.
         floor: height of the floor on which the clip was animated, m.
+        pieces: the frames between cuts; None is the clip's own.
     """
     points = clip.positions_ws[:, clip.rig.pelvis]
     highest = heights_under(terrain, points, SKY)
@@ -118,7 +120,7 @@ def path_heights(
     step = step_height(clip)
     near = heights_under(terrain, points, floor + step)
     starts = np.full(len(points), np.nan)
-    for piece in clip.pieces:
+    for piece in clip.pieces if pieces is None else pieces:
         start = near[piece] if not np.isnan(near[piece]).all() else highest[piece]
         starts[piece.start] = next(iter(start[~np.isnan(start)]), np.nan)
     starts[0] = next(iter(starts[~np.isnan(starts)]))

@@ -323,6 +323,11 @@ class PlacedMotion:
         """Where a sole is visibly in the ground."""
         return self.soles.gap < -self.measures.visible
 
+    @property
+    def stands_off(self) -> Bool[np.ndarray, "frames legs"]:
+        """Where a foot stands visibly off the ground, above or in it."""
+        return self.soles.stance & (np.abs(self.soles.gap) > self.measures.visible)
+
 
 def place(
     solved: Clip,
@@ -353,7 +358,7 @@ def soles(solved: Clip, flat: Clip, terrain: Terrain, floor: float = 0.0) -> Sol
     is higher, so that a character inside a hill is in the ground, and a roof is not ground.
     """
     points = sole_points(solved)
-    path = ground_path.path_heights(solved, terrain, floor)
+    path = ground_path.path_heights(solved, terrain, floor, flat.pieces)
     lowest = points[..., 1] if path is None else np.maximum(points[..., 1], path[:, None, None])
     ground = ground_path.heights_under(terrain, points, lowest + ground_path.step_height(flat))
     height = np.where(flat.observed[:, None, None], points[..., 1] - ground, np.nan)

@@ -239,9 +239,8 @@ class Animation:
 
     def _off_own_floor(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """That most of the feet that stand off the ground are off the clip's own floor alike."""
-        gap = motion.soles.gap
+        gap, off = motion.soles.gap, motion.stands_off
         own = measures.sole_points(self.clip)[..., 1].min(axis=-1) - self.floor
-        off = motion.soles.stance & (np.abs(gap) > motion.measures.visible)
         kept = off & (np.abs(own - gap) < 0.5 * np.abs(gap))
         if kept.sum() <= 0.5 * off.sum():
             return None
@@ -264,7 +263,7 @@ class Animation:
 
     def _off(self, motion: measures.PlacedMotion) -> measures.Cause | None:
         """That a system has left most of the feet that stand off the ground as animated."""
-        off = motion.soles.stance & (np.abs(motion.soles.gap) > motion.measures.visible)
+        off = motion.stands_off
         moved = motion.clip.joints_ws(2) - self.placed_clip.joints_ws(2)
         unmoved = off & (np.linalg.norm(moved, axis=-1) < UNMOVED)
         share = float(unmoved.sum() / max(int(off.sum()), 1))

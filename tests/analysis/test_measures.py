@@ -298,6 +298,16 @@ def test_the_ground_is_found_above_a_sole_deep_in_it_and_below_a_roof(walk):
     assert stairs.height.min() == pytest.approx(-1.5, abs=0.05), "from the tread above"
 
 
+def test_the_ground_stays_above_a_body_that_falls_into_it_where_there_is_more_below(walk):
+    z, edges = walk.positions_ws[:, walk.rig.pelvis, 2], np.arange(0.5, 2.7, 0.3)
+    stairs, above = flight(list(edges), rise=0.3), z > edges[-1] + 0.3
+    ground = terrain.combine(terrain_of(stairs), terrain.plane((0.0, -0.1, 0.0)))
+    heights = 0.3 * np.searchsorted(edges, z) - np.where(above, 2.0, 0.0)
+    falling = walk.with_motion(walk.positions_ws + heights[:, None, None] * UP, walk.rotations_ws)
+    assert falling.cuts == (int(np.argmax(above)),) and not walk.cuts
+    assert (measures.soles(falling, walk, ground).ground[above] > 2.0).all()
+
+
 def test_shares_count_frames_of_standing_and_of_moving_feet_by_their_lower_point(walk):
     gap = np.array([[-0.03, 0.0], [0.03, -0.05], [-0.01, 0.2], [np.nan, -0.021]])
     stance = np.array([[True, True], [True, False], [True, False], [True, False]])
