@@ -80,7 +80,7 @@ StrideProbe: ray_up m 1 0 2; ray_down m 1 0 2; rise_start 1 0 0 0.45; rise_end 1
   toe_clearance m 0.03 0 0.15; lift_per_rise 1 0.5 0 1.5; lift_ahead 1 0.85 0 2;
   lift_per_fall 1 0.35 0 1.5; lift_over 1 1.7 0 3; toes_up rad 0.1 0 0.6; toes_down rad 0.3 0 0.8;
   toes_down_per_height rad/m 0.9 0 3; toes_first rad/m 0.5 0 2; min_sole 1 0.65 0 1;
-  max_slide m 0.1 0 0.2; stance_time s 0.65 0.2 1.5; swing_time s 0.45 0.1 1
+  max_slide m 0.1 0 0.2; stance_time s 0.65 0.2 1.5; swing_time s 0.55 0.1 1
 GroundRoot: ray_up m 10 0 20; ray_down m inf 0 20; max_speed m/s 4 0.5 10; max_step m 0.4 0.1 1
 FootSeparation: distance m 0.1 0 0.3; half_life s 0.04 0.002 0.5
 RootTarget: adjust m 0 -0.1 0.1

@@ -23,7 +23,7 @@ from jaxik.stages.probe.foresight import Foresight
 from jaxik.stages.separation import NoSeparation
 from jaxik.world.frame import Stride
 from jaxik.world.terrain import Terrain
-from reference import characters
+from reference import characters, maths
 from reference.stages import foresight as reference
 from support.cases import QUICK, RIG
 from support.clips import assert_close, at, to_frames, to_rig, to_terrain
@@ -127,6 +127,14 @@ def flickering(frame: characters.Frame, n: int) -> characters.Frame:
     return dataclasses.replace(frame, stride=dataclasses.replace(frame.stride, standing=standing))
 
 
+def turning(frame: characters.Frame, n: int) -> characters.Frame:
+    """The frame with a character that turns to and fro as it walks."""
+    turn = maths.from_axis_angle(maths.Y, 0.5 * np.sin(n / 15))
+    world = frame.world_from_model
+    world = world._replace(rot=maths.multiply(turn, world.rot))
+    return dataclasses.replace(frame, world_from_model=world)
+
+
 def by_reference(
     frames: list[characters.Frame], times: dict[str, float]
 ) -> Iterator[tuple[tuple[int, int], reference.Swing, np.ndarray, np.ndarray]]:
@@ -134,15 +142,15 @@ def by_reference(
     for leg in range(2):
         before = None
         for n, frame in enumerate(frames):
-            planted, up = bool(frame.stride.standing[leg] > 0.5), reference.maths.Y
+            planted, up = bool(frame.stride.standing[leg] > 0.5), maths.Y
             before, last, following = reference.follow(times, RIG, frame, leg, planted, up, before)
             yield (n, leg), before, last, following
 
 
 def test_memory_agrees_with_the_reference():
-    """Also where a foot hardly leaves its foothold, while contact flickers."""
+    """Also where a foot hardly leaves its foothold, while contact flickers, and in turns."""
     frames = walk(RIG, COUNT, start=START, heading=0.3)
-    frames = [flickering(frame, n) for n, frame in enumerate(frames)]
+    frames = [turning(flickering(frame, n), n) for n, frame in enumerate(frames)]
     times = {"probe.stance_time": 0.6, "probe.swing_time": 0.4}
     ik = parameter_tree.replace(AS_PREDICTED, times)
     memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
@@ -151,6 +159,8 @@ def test_memory_agrees_with_the_reference():
         assert float(swings.fraction[at_leg]) == pytest.approx(swing.fraction, abs=1e-9)
         assert float(swings.time[at_leg]) == pytest.approx(swing.time, abs=1e-9)
         assert float(swings.further[at_leg]) == pytest.approx(swing.further, abs=1e-9)
+        assert float(swings.swing_time[at_leg]) == pytest.approx(swing.usual, abs=1e-9)
+        assert float(swings.lead[at_leg]) == pytest.approx(swing.lead, abs=1e-9)
         first = swings.first_way_ws, swing.first_way
         for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
             np.testing.assert_allclose(got[at_leg][[0, 2]], wanted[[0, 2]], atol=1e-9)
@@ -167,7 +177,7 @@ def test_a_swing_goes_on_and_leads_nearer_and_nearer_to_its_foothold():
     off = np.linalg.norm((stride.next_ws - frames.stride.next_ws)[..., [0, 2]], axis=-1)
     early, late = (off[swinging & (low <= fraction) & (fraction < high)].mean()
                    for low, high in ((0.2, 0.5), (0.8, 1.0)))  # fmt: skip
-    assert late < 0.5 * early and late < 0.1
+    assert late < 0.6 * early and early < 0.18 and late < 0.1
 
 
 @pytest.mark.slow
@@ -175,9 +185,9 @@ def test_how_sure_a_swing_is_of_its_foothold_agrees_with_the_reference():
     """On a walk whose swings lead elsewhere by up to a third of their way."""
     frames = walk(RIG, COUNT, start=START)
     sure = np.asarray(foreseen(PREDICTED, to_frames(frames))[1].sure)
-    times = {"probe.stance_time": 0.65, "probe.swing_time": 0.45}
+    times = {"probe.stance_time": 0.65, "probe.swing_time": 0.55}
     for at_leg, swing, last, following in by_reference(frames, times):
-        way = reference.across(following - last, reference.maths.Y)
+        way = reference.across(following - last, maths.Y)
         assert float(sure[at_leg]) == pytest.approx(reference.sureness(swing, way), abs=1e-6)
     assert ((sure > 0.05) & (sure < 0.95)).sum() > 5
 
@@ -205,5 +215,5 @@ def next_footholds(times: jax.Array, velocity_ws: jax.Array, still: jax.Array) -
 @pytest.mark.parametrize("moves", [True, False])
 def test_strides_have_equal_and_finite_derivatives_in_forward_and_reverse_mode(moves):
     velocity_ws = moves * frames_of().velocity_ws[20:60:2]
-    jacobian = finite_jacobian(next_footholds, np.array([0.65, 0.45]), velocity_ws, 1.0 - moves)
+    jacobian = finite_jacobian(next_footholds, np.array([0.65, 0.55]), velocity_ws, 1.0 - moves)
     assert (np.abs(jacobian[:, 1]).max() > 1e-3) == moves

@@ -34,6 +34,7 @@ BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch 
 FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
 SHORTEST, LONGEST = 0.5, 2.0  # duration of a swing, over the usual one
+LEARNT = 0.7  # of a step, that counts for the next one of its foot
 
 
 @struct
@@ -43,6 +44,8 @@ class Feet:
     up_ws: Float[Array, "*legs 3"]
     velocity_ws: Float[Array, "3"]
     """m/s, of the character over the ground."""
+    facing_ws: Float[Array, "3"]
+    """Unit, where the character faces."""
     from_root_ws: Float[Array, "legs 3"]
     """m, from the character's root to each animated ball."""
     ball_ws: Float[Array, "legs 3"] = place("point")
@@ -85,13 +88,24 @@ class Swings:
     """m, from the character's root to each animated ball, in the frame before."""
     velocity_ws: Float[Array, "3"]
     """m/s, of the character over the ground, smoothed."""
+    facing_ws: Float[Array, "3"]
+    """Unit, where the character faced in the frame before."""
+    turning_ws: Float[Array, "3"]
+    """rad/s, of the character, smoothed."""
+    swing_time: Float[Array, " legs"]
+    """s, how long each foot swings, as its last steps did."""
+    lead: Float[Array, " legs"]
+    """s, from when it lands until its hip is over its ball, as in its last steps."""
 
 
 def no_swings(rig: Rig) -> Swings:
     """Memory before the first frame."""
     zero = jnp.zeros_like(rig.side)
     offset = jnp.zeros((*zero.shape, 3), zero.dtype)
-    return Swings(zero, zero, zero, zero, zero, zero, offset, offset, offset, offset[0])
+    still = offset[0]
+    return Swings(
+        zero, zero, zero, zero, zero, zero, offset, offset, offset, still, still, still, zero, zero
+    )
 
 
 @struct
@@ -177,6 +191,7 @@ def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
     return Feet(
         up_ws=up,
         velocity_ws=frame.velocity_ws,
+        facing_ws=quat.rotate(world.rot, vec.constant(FORWARD, world.pos)),
         from_root_ws=ball - world.pos,
         ball_ws=ball,
         hip_ws=hip,
@@ -241,6 +256,9 @@ def follow_swings(
     it lands, later where its own motion takes it, which slows down as a minimum-jerk motion does
     (Flash and Hogan 1985). For how far it still goes, its pace counts as well as its pitch.
 
+    How long a foot swings, and how early it lands before its hip is over it, are the usual times at
+    first, then more and more those of its own steps.
+
     Args:
         now: the frame.
         feet: what it shows.
@@ -252,6 +270,9 @@ def follow_swings(
     guess = _first_guess(feet, stance_time, swing_time, gate)
     steady = now.progress(smoothing.fraction_of_half_life(jnp.asarray(STEADY, dt.dtype), dt))
     velocity = smoothing.lerp(before.velocity_ws, feet.velocity_ws, steady)
+    turn = vec.cross(before.facing_ws, feet.facing_ws)
+    turning = jnp.where(now.started, vec.safe_divide(turn, dt), 0.0)
+    turning = smoothing.lerp(before.turning_ws, turning, steady)
     moved = jnp.where(now.started, feet.from_root_ws - before.from_root_ws, 0.0)
     moved = vec.reject(moved + vec.scale(feet.velocity_ws, dt), feet.up_ws)
 
@@ -265,6 +286,8 @@ def follow_swings(
     same = 1.0 - (1.0 - before.planted) * smoothing.smoothstep(
         (vec.length(travelled) - NEAR) / NEAR
     )
+    landed = jnp.where(now.started, feet.planted * before.whole * (1.0 - same), 0.0)
+    swing_time, lead = _learnt(now, feet, before, velocity, landed, stance_time, swing_time)
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
@@ -288,11 +311,46 @@ def follow_swings(
         before.first_way_ws,
         feet.from_root_ws,
         velocity,
+        feet.facing_ws,
+        turning,
+        swing_time,
+        lead,
     )
     foot_velocity = vec.scale(moved, vec.safe_divide(jnp.ones_like(dt), dt))
-    next_ws = _landing(feet, swings, foot_velocity, stance_time, swing_time)
+    next_ws = _landing(feet, swings, foot_velocity)
     way = gate.choose(feet.planted[:, None], _way(feet, swings, next_ws), before.first_way_ws)
     return dataclasses.replace(swings, first_way_ws=way), next_ws
+
+
+def _learnt(
+    now: Moment,
+    feet: Feet,
+    before: Swings,
+    velocity_ws: Array,
+    landed: Array,
+    stance_time: Array,
+    swing_time: Array,
+) -> tuple[Float[Array, " legs"], Float[Array, " legs"]]:
+    """How long feet swing, s, and how long before their hips are over them they land, s.
+
+    Args:
+        now: the frame.
+        feet: what it shows.
+        before: memory.
+        velocity_ws: m/s, of the character, smoothed.
+        landed: 0..1, whether each foot has landed after a swing that was seen from its start.
+        stance_time: s, how long a foot usually stands.
+        swing_time: s, how long it usually swings.
+    """
+    shortest, longest = SHORTEST * swing_time, LONGEST * swing_time
+    swung = now.gate.clip(before.time + now.dt, shortest, longest, band=TIME_BAND)
+    velocity_ws = vec.reject(velocity_ws, feet.up_ws)
+    lead = time_ahead(velocity_ws, feet.ball_ws - feet.hip_ws)
+    lead = now.gate.clip(lead, jnp.zeros_like(stance_time), stance_time, band=TIME_BAND)
+    mean_swing = jnp.where(now.started, before.swing_time, swing_time)
+    mean_lead = jnp.where(now.started, before.lead, 0.5 * stance_time)
+    learnt = LEARNT * landed
+    return smoothing.lerp(mean_swing, swung, learnt), smoothing.lerp(mean_lead, lead, learnt)
 
 
 def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: AbstractGate) -> Instant:
@@ -304,9 +362,9 @@ def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: Abstra
     return Instant(fraction, since_last, guess.until_next)
 
 
-def time_left(swings: Swings, swing_time: Array) -> Float[Array, " legs"]:
+def time_left(swings: Swings) -> Float[Array, " legs"]:
     """s, until each foot lands; 0 while it stands."""
-    duration = _duration(swings.time, swings.fraction, swing_time)
+    duration = _duration(swings.time, swings.fraction, swings.swing_time)
     return jnp.where(swings.planted > 0.5, 0.0, (1.0 - swings.fraction) * duration)
 
 
@@ -350,14 +408,19 @@ def _fraction_of_motion(time: Array, travelled_ws: Array, moved_ws: Array, dt: A
     return fraction * vec.safe_divide(time, since)
 
 
-def _landing(
-    feet: Feet, swings: Swings, foot_velocity: Array, stance_time: Array, swing_time: Array
-) -> Float[Array, "legs 3"]:
-    """Where the balls will stand next, m, world space; their height says nothing."""
+def _landing(feet: Feet, swings: Swings, foot_velocity: Array) -> Float[Array, "legs 3"]:
+    """Where the balls will stand next, m, world space; their height says nothing.
+
+    A character that turns while it walks the way it faces goes on in an arc.
+    """
     fraction = LAST * smoothing.clip_to_one((swings.fraction + swings.further) / LAST)
-    duration = _duration(swings.time, fraction, swing_time)
-    until = (1.0 - fraction) * duration + 0.5 * stance_time
+    duration = _duration(swings.time, fraction, swings.swing_time)
+    until = (1.0 - fraction) * duration + swings.lead
+    forward = vec.dot(swings.velocity_ws, feet.facing_ws)
+    forward = jnp.where(forward > 0, forward, 0.0)
+    bend_ws = vec.cross(swings.turning_ws, vec.scale(feet.facing_ws, forward))
     by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)
+    by_hip += vec.scale(bend_ws, 0.5 * until * until)
     # Of a minimum-jerk motion, the way that is left over the speed and the duration.
     x = jnp.where(fraction > EARLY, fraction, EARLY)
     left = 1.0 - x

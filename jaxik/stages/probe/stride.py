@@ -28,8 +28,9 @@ WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part 
 STAYS = 2.0  # of a sole, that other ground has to support more than that to which a foot swings
 SOONEST, LATEST = 0.06, 0.2  # s, in which a foot slides to what holds it better
 # How far beyond a predicted foothold a foot lands, in parts of the way that it has left: about the
-# median and the quantiles of 10, 30, 70 and 90 % of 69 swings of two people on uneven ground.
-PLACES = np.array([0.15, -0.3, 0.0, 0.4, 0.8])
+# median and the quantiles of 10, 30, 70 and 90 %, half-way through 63 swings of two people on
+# uneven ground.
+PLACES = np.array([0.2, -0.1, 0.05, 0.4, 0.8])
 
 
 class StrideProbe(AbstractSupportedProbe):
@@ -51,9 +52,10 @@ class StrideProbe(AbstractSupportedProbe):
     they are predicted from the character's velocity: feet stand for `stance_time` and swing for
     `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986). A single frame
     tells little of that. With `remember_swings` on, the last foothold is where the foot stood and
-    the next where its swing so far leads (see `foresight`). As long as it is uncertain where that
-    is, the ground is the mean of that for five places about it; with `slide_to_support` on, the
-    foot then keeps to the tread on which it will land, and slides aside for that.
+    the next where its swing so far leads (see `foresight`); the times are then soon those of its
+    own steps. As long as it is uncertain where that is, the ground is the mean of that for five
+    places about it; with `slide_to_support` on, the foot then keeps to the tread on which it will
+    land, and slides aside for that.
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
@@ -93,7 +95,7 @@ class StrideProbe(AbstractSupportedProbe):
         follows="time",
     )
     swing_time: Leaf = duration(
-        0.45,
+        0.55,
         0.1,
         1,
         "How long a foot swings, where the animation does not give its footholds.",
@@ -125,7 +127,7 @@ class StrideProbe(AbstractSupportedProbe):
         times = self.stance_time, self.swing_time
         swings, next_ws = foresight.follow_swings(now, watched, state.swings, *times)
         last_ws, plan = watched.ball_ws - swings.travelled_ws, state.plan
-        until = foresight.time_left(swings, self.swing_time)
+        until = foresight.time_left(swings)
         sure = jnp.zeros_like(until)
         if self.slide_to_support:
             place_ws = jnp.where(swings.planted[:, None] > 0.5, last_ws, next_ws)

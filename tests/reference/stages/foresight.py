@@ -29,6 +29,13 @@ class Swing:
     first_way: Array
     ball_from_root: Array
     velocity: Array
+    facing: Array
+    turning: Array
+    """Angular velocity."""
+    usual: float
+    """Of its swings."""
+    lead: float
+    """From landing until the hip is over the ball."""
 
 
 def duration(time: float, fraction: float, usual: float) -> float:
@@ -47,12 +54,14 @@ def follow(
 ) -> tuple[Swing, Array, Array]:
     """Memory after the frame, and where the foot last stood and will stand."""
     stance, usual = parameters["probe.stance_time"], parameters["probe.swing_time"]
+    bounds = 0.5 * usual, 2.0 * usual
     world, dt = frame.world_from_model, float(frame.dt)
     ball, hip, ankle = (apply(world, x.pos[leg]) for x in (frame.toe, frame.hip, frame.ankle))
     rot = maths.multiply(frame.ankle.rot[leg], rig.ankle_from_foot[leg])
     sole = maths.rotate(world.rot, maths.rotate(rot, maths.Z))
     pitch = math.asin(clip(float(sole @ up), -1.0, 1.0))
     velocity, from_root = np.asarray(frame.travel_ws), ball - world.pos
+    facing = maths.rotate(world.rot, maths.Z)
 
     if before is None:
         flat = across(velocity, up)
@@ -65,11 +74,15 @@ def follow(
         time, lowest, moved = dt + fraction * usual, pitch, across(velocity * dt, up)
         travelled, smooth = since_last * flat, velocity
         further, whole = 0.0, False
+        turning, lead = np.zeros(3), 0.5 * stance
     else:
+        usual, lead = before.usual, before.lead
         moved = across(from_root - before.ball_from_root + velocity * dt, up)
         travelled = before.travelled + moved
         smoothing = maths.fraction_of_half_life(0.1, dt)
         smooth = before.velocity + smoothing * (velocity - before.velocity)
+        turn = np.cross(before.facing, facing) / dt
+        turning = before.turning + smoothing * (turn - before.turning)
         time, lowest = before.time + dt, min(before.lowest, pitch)
         fraction = turned(before, dt, pitch, lowest, usual)
         beyond = clip(by_motion(time, travelled, moved, dt) - fraction, -0.15, 0.15)
@@ -80,15 +93,36 @@ def follow(
         if before is None:
             travelled = np.zeros(3)
         elif not before.planted:  # only a foot that comes from elsewhere has a new foothold
-            travelled = travelled * (1.0 - smooth01((length(travelled) - 0.04) / 0.04))
+            away = smooth01((length(travelled) - 0.04) / 0.04)
+            travelled = travelled * (1.0 - away)
+            if before.whole:  # 70 % of a step count for the next
+                flat = across(smooth, up)
+                last_lead = float((ball - hip) @ flat / (flat @ flat)) if flat @ flat > 0 else 0.0
+                lead = lerp(lead, clip(last_lead, 0.0, stance), 0.7 * away)
+                usual = lerp(usual, clip(time, *bounds), 0.7 * away)
         travelled = travelled * (1.0 - maths.fraction_of_half_life(0.3, dt))
         time, fraction, lowest, further, whole = 0.0, 0.0, pitch, 0.0, True
     swing = Swing(
-        planted, time, fraction, lowest, further, whole, travelled, np.zeros(3), from_root, smooth
+        planted,
+        time,
+        fraction,
+        lowest,
+        further,
+        whole,
+        travelled,
+        np.zeros(3),
+        from_root,
+        smooth,
+        facing,
+        turning,
+        usual,
+        lead,
     )
     fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
-    by_hip = hip + smooth * ((1.0 - fraction) * lasts + 0.5 * stance)
+    until = (1.0 - fraction) * lasts + lead
+    ahead_ws = max(float(smooth @ facing), 0.0) * facing
+    by_hip = hip + smooth * until + np.cross(turning, ahead_ws) * until**2 / 2
     x = max(fraction, 0.3)
     covered = 10 * x**3 - 15 * x**4 + 6 * x**5
     speed = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time

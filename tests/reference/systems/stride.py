@@ -41,7 +41,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         | named("probe", lift_over=1.7)
         | named("probe", toes_up=0.1, toes_down=0.3, toes_down_per_height=0.9, toes_first=0.5)
         | named("probe", min_sole=0.65, max_slide=0.1, swing_as_animated=False, use_strides=True)
-        | named("probe", stance_time=0.65, swing_time=0.45)
+        | named("probe", stance_time=0.65, swing_time=0.55)
         | {"target.max_ankle_height": 0.8, "lock.enabled": False, "lock.hold_ball": True}
         | named("effector", extension=0.98, max_lift=0.6)
         | named("leg", max_knee_angle=math.pi, soften=0.985, as_animated=True)
