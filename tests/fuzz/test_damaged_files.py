@@ -97,6 +97,7 @@ REFUSED: dict[str, list[Change]] = {
         text(b'terrain = "', b'terrain = "' + 300 * b"x"),
     ],
     "state of a fit": [text(STATE + b"0", STATE + 100 * b"9")],
+    "search of a population": [text(b'"cost": 10.5', b'"cost": NaN')],
 }
 LOADED: dict[str, Change] = {
     "clip, NPZ": array("rig_thigh", lambda bone: bone.astype(np.float32)),
@@ -111,6 +112,7 @@ def test_what_was_found_is_mended(x64, tmp_path):
     for key in REFUSED | LOADED:
         form = FORMATS[key]
         path = tmp_path / form.file
+        path.parent.mkdir(exist_ok=True)
         for other, whole in form.beside.items():
             (tmp_path / other).write_bytes(whole())
         cases = [("loaded", bytes), *(("refused", change) for change in REFUSED.get(key, ()))]

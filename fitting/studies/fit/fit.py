@@ -223,7 +223,7 @@ class SearchRecord(TypedDict):
     noise: NotRequired[Annotated[Content, NoiseModel]]
     """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
-    cost: float
+    cost: Finite
     steps: int
     starts: int
     """Independent ones."""
