@@ -185,7 +185,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.extension", (0.92, 0.95), "+ pelvis height", TILTED),
         Case("pelvis.shift", (0.1, 0.3), "- pelvis forward", STEP_UP, clip="walks"),
         Case("pelvis.softness", (0.01, 0.05), "+ pelvis height", TILTED),
-        Case("pelvis.rise_speed", (0.05, 0.4), "+ pelvis height", STEP_UP, clip="walks"),
+        Case("pelvis.rise_speed", (0.05, 0.4), "+ pelvis height", STEP_BESIDE, clip="walks"),
         Case("pelvis.landing_time", (0.1, 0.2), "- pelvis height", RAMP_DOWN, clip="walks"),
         LIFTS("effector.by_contact", (False, True), "+ miss", TILTED),
         Case("effector.extension", (0.92, 0.95), "+ pitch", STEEP),
