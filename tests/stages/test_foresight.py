@@ -128,8 +128,8 @@ def flickering(frame: characters.Frame, n: int) -> characters.Frame:
 
 
 def turning(frame: characters.Frame, n: int) -> characters.Frame:
-    """The frame with a character that turns to and fro as it walks."""
-    turn = maths.from_axis_angle(maths.Y, 0.5 * np.sin(n / 15))
+    """The frame with a character that turns to and fro as it walks, and by 2 rad in a frame."""
+    turn = maths.from_axis_angle(maths.Y, 0.5 * np.sin(n / 15) + 2.0 * (n >= 70))
     world = frame.world_from_model
     world = world._replace(rot=maths.multiply(turn, world.rot))
     return dataclasses.replace(frame, world_from_model=world)

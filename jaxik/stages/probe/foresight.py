@@ -411,16 +411,19 @@ def _fraction_of_motion(time: Array, travelled_ws: Array, moved_ws: Array, dt: A
 def _landing(feet: Feet, swings: Swings, foot_velocity: Array) -> Float[Array, "legs 3"]:
     """Where the balls will stand next, m, world space; their height says nothing.
 
-    A character that turns while it walks the way it faces goes on in an arc.
+    A character that turns while it walks the way it faces goes on in an arc: turning by an angle a,
+    it comes aside by about a / 2 of its way; `1 + a^2 / 4` keeps that below half of the way, where
+    it turns on the spot or in a single frame.
     """
     fraction = LAST * smoothing.clip_to_one((swings.fraction + swings.further) / LAST)
     duration = _duration(swings.time, fraction, swings.swing_time)
     until = (1.0 - fraction) * duration + swings.lead
     forward = vec.dot(swings.velocity_ws, feet.facing_ws)
-    forward = jnp.where(forward > 0, forward, 0.0)
-    bend_ws = vec.cross(swings.turning_ws, vec.scale(feet.facing_ws, forward))
+    forward_ws = vec.scale(feet.facing_ws, jnp.where(forward > 0, forward, 0.0))
     by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)
-    by_hip += vec.scale(bend_ws, 0.5 * until * until)
+    angle_ws, way_ws = vec.scale(swings.turning_ws, until), vec.scale(forward_ws, until)
+    aside = 0.5 / (1.0 + 0.25 * vec.dot(angle_ws, angle_ws))
+    by_hip += vec.scale(vec.cross(angle_ws, way_ws), aside)
     # Of a minimum-jerk motion, the way that is left over the speed and the duration.
     x = jnp.where(fraction > EARLY, fraction, EARLY)
     left = 1.0 - x

@@ -122,7 +122,9 @@ def follow(
     lasts = duration(time, fraction, usual)
     until = (1.0 - fraction) * lasts + lead
     ahead_ws = max(float(smooth @ facing), 0.0) * facing
-    by_hip = hip + smooth * until + np.cross(turning, ahead_ws) * until**2 / 2
+    angle = turning * until
+    bend = np.cross(angle, ahead_ws * until) / (2.0 + 0.5 * float(angle @ angle))
+    by_hip = hip + smooth * until + bend
     x = max(fraction, 0.3)
     covered = 10 * x**3 - 15 * x**4 + 6 * x**5
     speed = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time
