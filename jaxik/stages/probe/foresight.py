@@ -412,8 +412,8 @@ def _landing(feet: Feet, swings: Swings, foot_velocity: Array) -> Float[Array, "
     """Where the balls will stand next, m, world space; their height says nothing.
 
     A character that turns while it walks the way it faces goes on in an arc: turning by an angle a,
-    it comes aside by about a / 2 of its way; `1 + a^2 / 4` keeps that below half of the way, where
-    it turns on the spot or in a single frame.
+    it comes aside by `(1 - cos a) / a` of its way, nearly `a / 2 / (1 + a^2 / 12)`, which does not
+    come back to 0 where it turns in a single frame.
     """
     fraction = LAST * smoothing.clip_to_one((swings.fraction + swings.further) / LAST)
     duration = _duration(swings.time, fraction, swings.swing_time)
@@ -422,7 +422,7 @@ def _landing(feet: Feet, swings: Swings, foot_velocity: Array) -> Float[Array, "
     forward_ws = vec.scale(feet.facing_ws, jnp.where(forward > 0, forward, 0.0))
     by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)
     angle_ws, way_ws = vec.scale(swings.turning_ws, until), vec.scale(forward_ws, until)
-    aside = 0.5 / (1.0 + 0.25 * vec.dot(angle_ws, angle_ws))
+    aside = 0.5 / (1.0 + vec.dot(angle_ws, angle_ws) / 12.0)
     by_hip += vec.scale(vec.cross(angle_ws, way_ws), aside)
     # Of a minimum-jerk motion, the way that is left over the speed and the duration.
     x = jnp.where(fraction > EARLY, fraction, EARLY)

@@ -123,7 +123,7 @@ def follow(
     until = (1.0 - fraction) * lasts + lead
     ahead_ws = max(float(smooth @ facing), 0.0) * facing
     angle = turning * until
-    bend = np.cross(angle, ahead_ws * until) / (2.0 + 0.5 * float(angle @ angle))
+    bend = np.cross(angle, ahead_ws * until) / (2.0 + float(angle @ angle) / 6.0)
     by_hip = hip + smooth * until + bend
     x = max(fraction, 0.3)
     covered = 10 * x**3 - 15 * x**4 + 6 * x**5
