@@ -347,10 +347,10 @@ def _learnt(
     velocity_ws = vec.reject(velocity_ws, feet.up_ws)
     lead = time_ahead(velocity_ws, feet.ball_ws - feet.hip_ws)
     lead = now.gate.clip(lead, jnp.zeros_like(stance_time), stance_time, band=TIME_BAND)
-    mean_swing = jnp.where(now.started, before.swing_time, swing_time)
-    mean_lead = jnp.where(now.started, before.lead, 0.5 * stance_time)
+    usual_swing = jnp.where(now.started, before.swing_time, swing_time)
+    usual_lead = jnp.where(now.started, before.lead, 0.5 * stance_time)
     learnt = LEARNT * landed
-    return smoothing.lerp(mean_swing, swung, learnt), smoothing.lerp(mean_lead, lead, learnt)
+    return smoothing.lerp(usual_swing, swung, learnt), smoothing.lerp(usual_lead, lead, learnt)
 
 
 def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: AbstractGate) -> Instant:
