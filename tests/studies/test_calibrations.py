@@ -329,10 +329,13 @@ def test_the_picture_marks_ranks_that_leave_their_band(finished):
 
 @pytest.mark.slow
 def test_ozz_is_calibrated(tmp_path):
-    """The whole path, through the pipeline and as users run it, with a fixed seed."""
+    """The whole path, through the pipeline and as users run it, with a fixed seed.
+
+    Of only 8 motions, one of seven parameters may well be inside its interval 3 times by chance.
+    """
     experiment = ROOT / "data" / "experiments" / "calibration" / "ozz.toml"
     out = tmp_path / "out"
-    command = ["calibrate", str(experiment), "-n", "8", "-o", str(out)]
+    command = ["calibrate", str(experiment), "-n", "60", "-o", str(out)]
     done = subprocess.run(
         [sys.executable, "-m", "fitting.cli.main", *command],
         cwd=ROOT,
@@ -343,8 +346,8 @@ def test_ozz_is_calibrated(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     numbers = json.loads((out / "calibration.json").read_text())
     assert numbers["inside"] and not numbers["wrong"] and not numbers["unconverged"]
-    assert numbers["fit_coverage"]["hits"] >= 48 and numbers["fit_coverage"]["total"] == 56
-    assert numbers["recovery"]["hits"] == numbers["recovery"]["total"] >= 44
+    assert numbers["fit_coverage"]["hits"] >= 378 and numbers["fit_coverage"]["total"] == 420
+    assert numbers["recovery"]["hits"] == numbers["recovery"]["total"] >= 360
 
 
 @pytest.mark.slow
