@@ -32,6 +32,7 @@ from support.probing import level_blocks
 from support.strides import walk
 
 COUNT, HALF = 120, 60
+BALL_HEIGHT = float(to_rig(RIG).ball_height[0])
 START = (0.0, 0.0, -0.5)
 PREDICTED = dataclasses.replace(  # with few rules beside its probe, so that it compiles soon
     parameter_tree.with_option(jaxik.presets.stride(foretold=False), "probe.limited", False),
@@ -143,15 +144,28 @@ def by_reference(
         before = None
         for n, frame in enumerate(frames):
             planted, up = bool(frame.stride.standing[leg] > 0.5), maths.Y
-            before, last, following = reference.follow(times, RIG, frame, leg, planted, up, before)
+            before, last, following = reference.follow(
+                times, RIG, frame, leg, planted, up, BALL_HEIGHT, before
+            )
             yield (n, leg), before, last, following
 
 
-def test_memory_agrees_with_the_reference():
+def faster(frame: characters.Frame, factor: float, toes_up: float) -> characters.Frame:
+    """The frame of a motion that goes by a factor faster, with toes that point higher, rad."""
+    velocity = factor * np.asarray(frame.travel_ws)
+    up = maths.from_axis_angle(maths.X, -toes_up)
+    ankle = frame.ankle._replace(rot=np.array([maths.multiply(up, x) for x in frame.ankle.rot]))
+    return dataclasses.replace(frame, dt=frame.dt / factor, velocity_ws=velocity, ankle=ankle)
+
+
+# One who walks, one who nearly runs, and runners who land on their toes and on their heels.
+@pytest.mark.parametrize(("factor", "toes_up"), [(1.0, 0.0), (2.5, 0.0), (4.0, 0.0), (4.0, 0.15)])
+def test_memory_agrees_with_the_reference(factor, toes_up):
     """Also where a foot hardly leaves its foothold, while contact flickers, and in turns."""
-    frames = walk(RIG, COUNT, start=START, heading=0.3)
+    walked = walk(RIG, COUNT, start=START, heading=0.3)
+    frames = [faster(frame, factor, toes_up) for frame in walked]
     frames = [turning(flickering(frame, n), n) for n, frame in enumerate(frames)]
-    times = {"probe.stance_time": 0.6, "probe.swing_time": 0.4}
+    times = {"probe.stance_time": 0.6, "probe.swing_time": 0.5 / factor}
     ik = parameter_tree.replace(AS_PREDICTED, times)
     memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
     swings = memory.swings

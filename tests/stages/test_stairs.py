@@ -1,15 +1,23 @@
 """Random flights of stairs, the quick sibling of `python -m stairs`, and a few other grounds."""
 
+import dataclasses
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import fitting
 import jaxik
+from fitting.clips import Clip, load_clip
+from fitting.ground import ground_path
+from fitting.studies.animations import Animation
+from fitting.synthetic import actions
 from stairs import grounds
 from stairs.__main__ import BOUNDS
-from stairs.flights import Flight, sample
-from stairs.walks import Verdict, walked
+from stairs.flights import Flight, field_of, sample
+from stairs.walks import SETTLED, Verdict, walked
 
 
 def beyond(chosen: Sequence[Flight]) -> list[tuple[Flight, Verdict]]:
@@ -41,3 +49,35 @@ def test_feet_stand_on_treads_that_nothing_foretells():
     share = (verdicts <= np.array(BOUNDS)).mean(0)
     assert (share >= Verdict(off=0.99, pop=0.96, dip=0.96, bend=0.85, sunk=1.0)).all()
     assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.10]).all()
+
+
+def off_ground(clip: Clip, ground: grounds.Ground) -> float:
+    """How far the ball of a standing foot is off ground that nothing foretells, m, at most."""
+    frames = fitting.frames_from_clip(clip)
+    way = np.asarray(frames.world_from_model.pos)
+    moves = -0.3 - way[0, 2] + 0.0 * way
+    moves[:, 1] = ground_path.smooth(ground.levels(way[:, 2] + moves[:, 2]), 0.35 * clip.fps)
+    stride = dataclasses.replace(frames.stride, known=0.0 * frames.stride.known)
+    frames = dataclasses.replace(frames.translated(jnp.asarray(moves)), stride=stride)
+    animation = Animation(clip, field_of(ground.field_heights()), given_frames=frames)
+    toe = animation.run(jaxik.presets.stride(clip.rig, foretold=False)).pose.toe
+    ball = np.asarray(jax.vmap(jaxik.Transform.apply)(frames.world_from_model, toe.pos))
+    off = np.abs(ball[..., 1] - np.asarray(clip.rig.ball_height) - ground.heights(ball[..., 2]))
+    stands = np.asarray(stride.standing)[SETTLED:-SETTLED] > 0.5
+    return off[SETTLED:-SETTLED][stands].max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("captured", [True, False])
+def test_feet_of_runners_stand_on_ground_that_nothing_foretells(request, captured):
+    """A captured runner's balls are 2.1 cm off his own floor at times."""
+    if captured:
+        clip = load_clip(request.getfixturevalue("mocap") / "clips/cmu_asfamc/02_03.amc")
+    else:
+        clip = actions.run(2.0)
+    rng = np.random.default_rng(2)
+    chosen = [grounds.sample(rng) for _ in range(16)]
+    off = [off_ground(clip, x) for x in chosen if x.kind not in ("gaps", "roots")]
+    assert len(off) == 10
+    assert np.mean(off) < (0.035 if captured else 0.02)
+    assert max(off) < 0.06

@@ -21,6 +21,10 @@ TOES_DOWN, LEVEL = 0.25, 0.7
 TURN = 0.05  # rad, by which a sole must have turned back before its toes count as down most
 WAITS = 0.2  # of its lowest pitch, up to which a sole that is nearly level may wait for the ground
 PITCHED = 0.5  # rad, of a sole, from which its pitch tells how far the swing is
+# Squared speed over gravity and length of the legs (Froude number), up to which people walk and
+# from which they run (Alexander 1989: from one to the other at 0.5).
+WALKS, RUNS = 0.4, 0.7
+GRAVITY = 9.81  # m/s²
 LAST = 0.98  # of a swing, where it waits for a foot that lands late
 CORRECTION = 0.035  # s, half-life with which the fraction of a swing goes to what the pitch says
 SETTLED = 0.3  # s, half-life with which a foothold follows a standing ball that slides
@@ -35,6 +39,7 @@ FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
 SHORTEST, LONGEST = 0.5, 2.0  # duration of a swing, over the usual one
 LEARNT = 0.7  # of a step, that counts for the next one of its foot
+AHEAD = 0.5  # of the length of its leg, how far ahead of its hip a ball lands at most
 
 
 @struct
@@ -250,11 +255,14 @@ def follow_swings(
 ) -> tuple[Swings, Float[Array, "legs 3"]]:
     """Memory after this frame, and where each foot will stand next, m, world space.
 
-    A swing goes on with time. Once its toes have pointed down most, the pitch of the sole says how
-    far it is, since the sole turns evenly until it is level again; from then on the swing goes on
-    at the pace that it had. At first a foot is expected as far ahead of its hip as it will be when
-    it lands, later where its own motion takes it, which slows down as a minimum-jerk motion does
-    (Flash and Hogan 1985). For how far it still goes, its pace counts as well as its pitch.
+    A swing goes on with time. Once the toes of one who walks have pointed down most, the pitch of
+    the sole says how far it is, since the sole turns evenly until it is level again; from then on
+    the swing goes on at the pace that it had. Toes of one who runs point down most at any time, but
+    such a foot comes down evenly, so late in its swing its height says when it lands.
+
+    At first a foot is expected as far ahead of its hip as it will be when it lands, later where its
+    own motion takes it, which slows down as a minimum-jerk motion does (Flash and Hogan 1985). For
+    how far it still goes, its pace counts as well as its pitch.
 
     How long a foot swings, and how early it lands before its hip is over it, are the usual times at
     first, then more and more those of its own steps.
@@ -291,13 +299,20 @@ def follow_swings(
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
-    fraction = _turned(before.fraction, before.fraction + dt * pace, feet.pitch, lowest, dt)
+    runs = _runs(feet, velocity)
+    by_time = before.fraction + dt * pace
+    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, 1.0 - runs, dt)
+    by_height = _fraction_of_height(feet, before, _duration(time, fraction, swing_time), dt)
+    late = runs * smoothing.smoothstep((fraction - 0.5) / 0.2)
+    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
+    latest = jnp.where(by_height < LAST, by_height, LAST)
+    higher = jnp.where(latest > fraction, latest, fraction)
+    fraction = smoothing.lerp(fraction, higher, late * correction)
     fraction = jnp.where(now.started, fraction, guess.fraction)
     by_motion = _fraction_of_motion(time, travelled, moved, dt) - fraction
     farthest = jnp.asarray(FARTHEST, dt.dtype)
     by_motion = gate.clip(by_motion, -farthest, farthest, band=FRACTION_BAND)
     counts = before.whole * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
-    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     further = smoothing.lerp(before.further, BY_MOTION * counts * by_motion, correction)
     zero = jnp.zeros_like(time)
     swings = Swings(
@@ -377,9 +392,18 @@ def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
     return smoothing.lerp(swing_time + jnp.zeros_like(so_far), so_far, pace_known)
 
 
-def _turned(before: Array, by_time: Array, pitch: Array, lowest: Array, dt: Array) -> Array:
+def _runs(feet: Feet, velocity_ws: Array) -> Float[Array, " legs"]:
+    """0..1, how far a character at this velocity runs."""
+    velocity_ws = vec.reject(velocity_ws, feet.up_ws)
+    froude = vec.dot(velocity_ws, velocity_ws) / (GRAVITY * (feet.rig.thigh + feet.rig.shin))
+    return smoothing.smoothstep((froude - WALKS) / (RUNS - WALKS))
+
+
+def _turned(
+    before: Array, by_time: Array, pitch: Array, lowest: Array, walks: Array, dt: Array
+) -> Array:
     """How far each swing is, by time and by the pitch of its sole; it never goes back."""
-    pitched = smoothing.clip_to_one(-lowest / PITCHED)
+    pitched = walks * smoothing.clip_to_one(-lowest / PITCHED)
     turned = smoothing.smoothstep((pitch - lowest) / TURN)
     latest = LAST - pitched * (1.0 - turned) * (LAST - TOES_DOWN)
     fraction = jnp.where(by_time < latest, by_time, latest)
@@ -390,6 +414,19 @@ def _turned(before: Array, by_time: Array, pitch: Array, lowest: Array, dt: Arra
     weight *= smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     fraction = smoothing.lerp(fraction, by_pitch, weight)
     return jnp.where(fraction > before, fraction, before)
+
+
+def _fraction_of_height(feet: Feet, before: Swings, duration: Array, dt: Array) -> Array:
+    """How far each swing is, if its sole comes to rest on the animation's floor evenly; or 0.
+
+    Slowing down evenly takes twice as long as the way that is left would at the speed now.
+    """
+    ball = vec.dot(feet.from_root_ws, feet.up_ws) - feet.rig.ball_height
+    heel = ball - jnp.sin(feet.pitch) * feet.rig.foot
+    height = jnp.where(heel < ball, heel, ball)
+    left = 2.0 * dt * jnp.where(height > 0, height, 0.0)
+    sunk = duration * vec.dot(before.from_root_ws - feet.from_root_ws, feet.up_ws)
+    return jnp.where(sunk > left, 1.0 - vec.safe_divide(left, sunk), 0.0)
 
 
 def _fraction_of_motion(time: Array, travelled_ws: Array, moved_ws: Array, dt: Array) -> Array:
@@ -417,7 +454,10 @@ def _landing(feet: Feet, swings: Swings, foot_velocity: Array) -> Float[Array, "
     """
     fraction = LAST * smoothing.clip_to_one((swings.fraction + swings.further) / LAST)
     duration = _duration(swings.time, fraction, swings.swing_time)
-    until = (1.0 - fraction) * duration + swings.lead
+    speed = vec.length(vec.reject(swings.velocity_ws, feet.up_ws))
+    most = AHEAD * (feet.rig.thigh + feet.rig.shin)
+    lead = jnp.where(speed * swings.lead < most, swings.lead, vec.safe_divide(most, speed))
+    until = (1.0 - fraction) * duration + lead
     forward = vec.dot(swings.velocity_ws, feet.facing_ws)
     forward_ws = vec.scale(feet.facing_ws, jnp.where(forward > 0, forward, 0.0))
     by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)

@@ -13,6 +13,7 @@ from reference.characters import Frame, Rig
 from reference.maths import Array, across, apply, clip, length, lerp, smooth01
 
 TOES_DOWN, LEVEL, LAST = 0.25, 0.7, 0.98
+GRAVITY = 9.81
 
 
 @dataclass
@@ -50,9 +51,13 @@ def follow(
     leg: int,
     planted: bool,
     up: Array,
+    ball_height: float,
     before: Swing | None,
 ) -> tuple[Swing, Array, Array]:
-    """Memory after the frame, and where the foot last stood and will stand."""
+    """Memory after the frame, and where the foot last stood and will stand.
+
+    `ball_height` is that of the ball of a foot that stands flat.
+    """
     stance, usual = parameters["probe.stance_time"], parameters["probe.swing_time"]
     bounds = 0.5 * usual, 2.0 * usual
     world, dt = frame.world_from_model, float(frame.dt)
@@ -62,6 +67,11 @@ def follow(
     pitch = math.asin(clip(float(sole @ up), -1.0, 1.0))
     velocity, from_root = np.asarray(frame.travel_ws), ball - world.pos
     facing = maths.rotate(world.rot, maths.Z)
+    thigh, shin = (
+        frame.knee.pos[leg] - frame.hip.pos[leg],
+        frame.ankle.pos[leg] - frame.knee.pos[leg],
+    )
+    leg_length = length(thigh) + length(shin)
 
     if before is None:
         flat = across(velocity, up)
@@ -84,7 +94,17 @@ def follow(
         turn = np.cross(before.facing, facing) / dt
         turning = before.turning + smoothing * (turn - before.turning)
         time, lowest = before.time + dt, min(before.lowest, pitch)
-        fraction = turned(before, dt, pitch, lowest, usual)
+        speed = length(across(smooth, up))
+        runs = smooth01((speed**2 / (GRAVITY * leg_length) - 0.4) / 0.3)
+        fraction = turned(before, dt, pitch, lowest, usual, runs)
+        over_floor = float(from_root @ up) - ball_height
+        lowest_point = max(min(over_floor, over_floor - math.sin(pitch) * rig.foot), 0.0)
+        sinking = float((before.ball_from_root - from_root) @ up) / dt
+        if sinking > 0:
+            rest = 2.0 * lowest_point / sinking / duration(time, fraction, usual)
+            late = runs * smooth01((fraction - 0.5) / 0.2)
+            share = late * maths.fraction_of_half_life(0.035, dt)
+            fraction += share * max(min(1.0 - rest, LAST) - fraction, 0.0)
         beyond = clip(by_motion(time, travelled, moved, dt) - fraction, -0.15, 0.15)
         beyond *= 0.6 * before.whole * smooth01((fraction - 0.3) / 0.15)
         correction = maths.fraction_of_half_life(0.035, dt)
@@ -120,15 +140,17 @@ def follow(
     )
     fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
-    until = (1.0 - fraction) * lasts + lead
+    until = (1.0 - fraction) * lasts
+    speed = length(across(smooth, up))
+    until += lead if speed * lead < 0.5 * leg_length else 0.5 * leg_length / speed
     ahead_ws = max(float(smooth @ facing), 0.0) * facing
     angle = turning * until
     bend = np.cross(angle, ahead_ws * until) / (2.0 + float(angle @ angle) / 6.0)
     by_hip = hip + smooth * until + bend
     x = max(fraction, 0.3)
     covered = 10 * x**3 - 15 * x**4 + 6 * x**5
-    speed = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time
-    by_ball = ball + moved / dt * lasts * (1.0 - covered) / speed
+    pace = 30 * x**2 * (1 - x) ** 2  # of a minimum-jerk motion over the unit way in unit time
+    by_ball = ball + moved / dt * lasts * (1.0 - covered) / pace
     last = ball - travelled
     following = by_hip + smooth01((fraction - 0.3) / 0.4) * (by_ball - by_hip)
     if planted:
@@ -163,9 +185,11 @@ def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
     return low * time / since
 
 
-def turned(before: Swing, dt: float, pitch: float, lowest: float, usual: float) -> float:
-    """How far the swing is, by time and by the pitch of the sole."""
-    pitched = clip(-lowest / 0.5, 0.0, 1.0)
+def turned(
+    before: Swing, dt: float, pitch: float, lowest: float, usual: float, runs: float
+) -> float:
+    """How far the swing is, by time and, of one who walks, by the pitch of the sole."""
+    pitched = clip(-lowest / 0.5, 0.0, 1.0) * (1.0 - runs)
     back = smooth01((pitch - lowest) / 0.05)
     latest = LAST - pitched * (1.0 - back) * (LAST - TOES_DOWN)
     lasts = duration(before.time, before.fraction, usual)
