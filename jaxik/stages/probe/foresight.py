@@ -24,9 +24,11 @@ PITCHED = 0.5  # rad, of a sole, from which its pitch tells how far the swing is
 # Squared speed over gravity and length of the legs (Froude number), up to which people walk and
 # from which they run (Alexander 1989: from one to the other at 0.5).
 WALKS, RUNS = 0.4, 0.7
+BACK = 0.1  # root of that number from which one walks backwards
 GRAVITY = 9.81  # m/s²
 LAST = 0.98  # of a swing, where it waits for a foot that lands late
 CORRECTION = 0.035  # s, half-life with which the fraction of a swing goes to what the pitch says
+SINKING = 0.02  # s, half-life with which it goes to what the height of the sole says
 SETTLED = 0.3  # s, half-life with which a foothold follows a standing ball that slides
 NEAR = 0.04  # m, from the last foothold, up to which a foot has not left it
 STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
@@ -257,8 +259,8 @@ def follow_swings(
 
     A swing goes on with time. Once the toes of one who walks have pointed down most, the pitch of
     the sole says how far it is, since the sole turns evenly until it is level again; from then on
-    the swing goes on at the pace that it had. Toes of one who runs point down most at any time, but
-    such a foot comes down evenly, so late in its swing its height says when it lands.
+    the swing goes on at the pace that it had. Toes of one who runs or walks backwards point down
+    most at other times; there the height of the sole, once it sinks, says when it lands.
 
     At first a foot is expected as far ahead of its hip as it will be when it lands, later where its
     own motion takes it, which slows down as a minimum-jerk motion does (Flash and Hogan 1985). For
@@ -299,19 +301,16 @@ def follow_swings(
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
-    runs = _runs(feet, velocity)
+    walks = _walks(feet, velocity)
     by_time = before.fraction + dt * pace
-    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, 1.0 - runs, dt)
-    by_height = _fraction_of_height(feet, before, _duration(time, fraction, swing_time), dt)
-    late = runs * smoothing.smoothstep((fraction - 0.5) / 0.2)
-    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
-    latest = jnp.where(by_height < LAST, by_height, LAST)
-    higher = jnp.where(latest > fraction, latest, fraction)
-    fraction = smoothing.lerp(fraction, higher, late * correction)
+    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, walks, dt)
+    duration = _duration(time, fraction, swing_time)
+    fraction = _sunk(feet, before, fraction, duration, 1.0 - walks, dt)
     fraction = jnp.where(now.started, fraction, guess.fraction)
     by_motion = _fraction_of_motion(time, travelled, moved, dt) - fraction
     farthest = jnp.asarray(FARTHEST, dt.dtype)
     by_motion = gate.clip(by_motion, -farthest, farthest, band=FRACTION_BAND)
+    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     counts = before.whole * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
     further = smoothing.lerp(before.further, BY_MOTION * counts * by_motion, correction)
     zero = jnp.zeros_like(time)
@@ -392,11 +391,14 @@ def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
     return smoothing.lerp(swing_time + jnp.zeros_like(so_far), so_far, pace_known)
 
 
-def _runs(feet: Feet, velocity_ws: Array) -> Float[Array, " legs"]:
-    """0..1, how far a character at this velocity runs."""
+def _walks(feet: Feet, velocity_ws: Array) -> Float[Array, " legs"]:
+    """0..1, how far a character at this velocity walks, and not backwards."""
     velocity_ws = vec.reject(velocity_ws, feet.up_ws)
-    froude = vec.dot(velocity_ws, velocity_ws) / (GRAVITY * (feet.rig.thigh + feet.rig.shin))
-    return smoothing.smoothstep((froude - WALKS) / (RUNS - WALKS))
+    falls = GRAVITY * (feet.rig.thigh + feet.rig.shin)  # m²/s²
+    froude = vec.dot(velocity_ws, velocity_ws) / falls
+    back = -vec.dot(velocity_ws, feet.ahead_ws) / vec.safe_sqrt(falls)
+    forward = 1.0 - smoothing.smoothstep(back / BACK)
+    return forward * (1.0 - smoothing.smoothstep((froude - WALKS) / (RUNS - WALKS)))
 
 
 def _turned(
@@ -416,17 +418,24 @@ def _turned(
     return jnp.where(fraction > before, fraction, before)
 
 
-def _fraction_of_height(feet: Feet, before: Swings, duration: Array, dt: Array) -> Array:
-    """How far each swing is, if its sole comes to rest on the animation's floor evenly; or 0.
+def _sunk(
+    feet: Feet, before: Swings, fraction: Array, duration: Array, counts: Array, dt: Array
+) -> Array:
+    """How far each swing is, also by how fast its sole sinks to the animation's floor.
 
-    Slowing down evenly takes twice as long as the way that is left would at the speed now.
+    It is taken to need half as long again as at that speed: soles that slow down evenly need twice
+    as long, those of people hardly slow down before they land.
     """
     ball = vec.dot(feet.from_root_ws, feet.up_ws) - feet.rig.ball_height
     heel = ball - jnp.sin(feet.pitch) * feet.rig.foot
     height = jnp.where(heel < ball, heel, ball)
-    left = 2.0 * dt * jnp.where(height > 0, height, 0.0)
+    left = 1.5 * dt * jnp.where(height > 0, height, 0.0)
     sunk = duration * vec.dot(before.from_root_ws - feet.from_root_ws, feet.up_ws)
-    return jnp.where(sunk > left, 1.0 - vec.safe_divide(left, sunk), 0.0)
+    by_height = jnp.where(sunk > left, LAST - LAST * vec.safe_divide(left, sunk), 0.0)
+    counts = counts * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
+    counts *= smoothing.fraction_of_half_life(jnp.asarray(SINKING, dt.dtype), dt)
+    further = by_height - fraction
+    return fraction + counts * jnp.where(further > 0, further, 0.0)
 
 
 def _fraction_of_motion(time: Array, travelled_ws: Array, moved_ws: Array, dt: Array) -> Array:

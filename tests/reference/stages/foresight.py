@@ -94,17 +94,20 @@ def follow(
         turn = np.cross(before.facing, facing) / dt
         turning = before.turning + smoothing * (turn - before.turning)
         time, lowest = before.time + dt, min(before.lowest, pitch)
-        speed = length(across(smooth, up))
-        runs = smooth01((speed**2 / (GRAVITY * leg_length) - 0.4) / 0.3)
-        fraction = turned(before, dt, pitch, lowest, usual, runs)
+        flat = across(smooth, up)
+        runs = smooth01((float(flat @ flat) / (GRAVITY * leg_length) - 0.4) / 0.3)
+        ahead = maths.unit(across(sole, up), facing)
+        back = smooth01(-float(flat @ ahead) / math.sqrt(GRAVITY * leg_length) / 0.1)
+        walks = (1.0 - runs) * (1.0 - back)
+        fraction = turned(before, dt, pitch, lowest, usual, walks)
         over_floor = float(from_root @ up) - ball_height
         lowest_point = max(min(over_floor, over_floor - math.sin(pitch) * rig.foot), 0.0)
         sinking = float((before.ball_from_root - from_root) @ up) / dt
         if sinking > 0:
-            rest = 2.0 * lowest_point / sinking / duration(time, fraction, usual)
-            late = runs * smooth01((fraction - 0.5) / 0.2)
-            share = late * maths.fraction_of_half_life(0.035, dt)
-            fraction += share * max(min(1.0 - rest, LAST) - fraction, 0.0)
+            rest = 1.5 * lowest_point / sinking / duration(time, fraction, usual)
+            share = (1.0 - walks) * smooth01((fraction - 0.3) / 0.15)
+            share *= maths.fraction_of_half_life(0.02, dt)
+            fraction += share * max(LAST * (1.0 - rest) - fraction, 0.0)
         beyond = clip(by_motion(time, travelled, moved, dt) - fraction, -0.15, 0.15)
         beyond *= 0.6 * before.whole * smooth01((fraction - 0.3) / 0.15)
         correction = maths.fraction_of_half_life(0.035, dt)
@@ -186,10 +189,10 @@ def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
 
 
 def turned(
-    before: Swing, dt: float, pitch: float, lowest: float, usual: float, runs: float
+    before: Swing, dt: float, pitch: float, lowest: float, usual: float, walks: float
 ) -> float:
-    """How far the swing is, by time and, of one who walks, by the pitch of the sole."""
-    pitched = clip(-lowest / 0.5, 0.0, 1.0) * (1.0 - runs)
+    """How far the swing is, by time and, of one who walks ahead, by the pitch of the sole."""
+    pitched = clip(-lowest / 0.5, 0.0, 1.0) * walks
     back = smooth01((pitch - lowest) / 0.05)
     latest = LAST - pitched * (1.0 - back) * (LAST - TOES_DOWN)
     lasts = duration(before.time, before.fraction, usual)
