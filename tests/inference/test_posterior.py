@@ -191,6 +191,11 @@ def test_thinning_stores_one_step_in_so_many_and_a_short_run_says_that_it_is():
     assert not third.converged and "too short: 60 steps" in third.message
 
 
+def test_a_run_that_has_converged_goes_on_to_the_least_steps_it_is_asked_for():
+    soon, later = (normal(2).sample(thin_by=2, min_steps=least) for least in (0, 1500))
+    assert soon.converged and 2 * len(soon.u) < 1500 <= 2 * len(later.u) < 2200
+
+
 def test_progress_is_reported_and_nothing_compiles_between_checks():
     reports = []
     TRACES.clear()

@@ -469,6 +469,7 @@ def test_where_feet_are_furthest_off_is_the_worst_window(compared):
     gap[150:160, 0] = -0.3
     gap[30:60, 1] = 9.0  # a moving foot, which may be above the ground
     stance = np.zeros((400, 2), bool)
+    stance[150:160, 0] = True  # a standing foot counts in the ground as well
     height = np.repeat(gap[..., None], 2, axis=-1)
     feet = dataclasses.replace(feet, height=height, stance=stance)
     start, end = comparison.worst_seconds(feet, 60.0)
