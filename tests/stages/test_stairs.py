@@ -55,7 +55,7 @@ def off_ground(clip: Clip, ground: grounds.Ground) -> float:
     """How far the ball of a standing foot is off ground that nothing foretells, m, at most."""
     frames = fitting.frames_from_clip(clip)
     way = np.asarray(frames.world_from_model.pos)
-    moves = -0.3 - way[0, 2] + 0.0 * way
+    moves = np.tile([0.0, 0.0, -0.3 - way[:, 2].min()], (len(way), 1))
     moves[:, 1] = ground_path.smooth(ground.levels(way[:, 2] + moves[:, 2]), 0.35 * clip.fps)
     stride = replace(frames.stride, known=0.0 * frames.stride.known)
     frames = replace(frames.translated(jnp.asarray(moves)), stride=stride)
@@ -87,5 +87,5 @@ def test_feet_of_runners_and_of_walkers_back_stand_on_ground_that_nothing_forete
     chosen = [grounds.sample(rng) for _ in range(16)]
     off = [off_ground(clip, x) for x in chosen if x.kind not in ("gaps", "roots")]
     assert len(off) == 10
-    assert np.mean(off) < (0.015 if file is None else 0.036)
+    assert np.mean(off) < (0.015 if file is None else 0.04)
     assert max(off) < (0.06 if file is None else 0.12)

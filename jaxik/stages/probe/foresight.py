@@ -310,8 +310,8 @@ def follow_swings(
     by_motion = _fraction_of_motion(time, travelled, moved, dt) - fraction
     farthest = jnp.asarray(FARTHEST, dt.dtype)
     by_motion = gate.clip(by_motion, -farthest, farthest, band=FRACTION_BAND)
-    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     counts = before.whole * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
+    correction = smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     further = smoothing.lerp(before.further, BY_MOTION * counts * by_motion, correction)
     zero = jnp.zeros_like(time)
     swings = Swings(
