@@ -331,7 +331,7 @@ def test_the_picture_marks_ranks_that_leave_their_band(finished):
 def test_ozz_is_calibrated(tmp_path):
     """The whole path, through the pipeline and as users run it, with a fixed seed.
 
-    Of only 8 motions, one of seven parameters may well be inside its interval 3 times by chance.
+    Of 8 motions, intervals of one of the seven parameters held 3 truths by chance.
     """
     experiment = ROOT / "data" / "experiments" / "calibration" / "ozz.toml"
     out = tmp_path / "out"

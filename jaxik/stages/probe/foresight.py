@@ -63,6 +63,8 @@ class Feet:
     """s, in which the hip arrives over the ankle at its velocity now."""
     pitch: Float[Array, " legs"]
     """rad, of the animated sole, toes up."""
+    height: Float[Array, " legs"]
+    """m, of its lowest point over the animation's floor."""
     planted: Float[Array, " legs"]
     ahead_ws: Float[Array, "legs 3"]
     """Unit, horizontal direction of each animated foot."""
@@ -195,6 +197,10 @@ def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
     sole = quat.rotate(
         quat.multiply(ankle.rot, inputs.rig.ankle_from_foot), vec.constant(FORWARD, ball)
     )
+    rises = vec.dot(sole, up)
+    ball_height = vec.dot(ball - world.pos, up) - inputs.rig.ball_height
+    heel_height = ball_height - rises * inputs.rig.foot
+    height = jnp.where(heel_height < ball_height, heel_height, ball_height)
     return Feet(
         up_ws=up,
         velocity_ws=frame.velocity_ws,
@@ -203,7 +209,8 @@ def watch(inputs: Inputs, contact: Contact, foot_height: Array) -> Feet:
         ball_ws=ball,
         hip_ws=hip,
         ahead=time_ahead(vec.reject(frame.velocity_ws, up), ankle.pos - hip),
-        pitch=vec.safe_arctan2(vec.dot(sole, up), vec.length(vec.reject(sole, up))),
+        pitch=vec.safe_arctan2(rises, vec.length(vec.reject(sole, up))),
+        height=jnp.where(height > 0, height, 0.0),
         planted=contact.planted,
         ahead_ws=foot_heading(inputs)[0],
         foot_height=foot_height,
@@ -426,10 +433,7 @@ def _sunk(
     It is taken to need half as long again as at that speed: soles that slow down evenly need twice
     as long, those of people hardly slow down before they land.
     """
-    ball = vec.dot(feet.from_root_ws, feet.up_ws) - feet.rig.ball_height
-    heel = ball - jnp.sin(feet.pitch) * feet.rig.foot
-    height = jnp.where(heel < ball, heel, ball)
-    left = 1.5 * dt * jnp.where(height > 0, height, 0.0)
+    left = 1.5 * dt * feet.height
     sunk = duration * vec.dot(before.from_root_ws - feet.from_root_ws, feet.up_ws)
     by_height = jnp.where(sunk > left, LAST - LAST * vec.safe_divide(left, sunk), 0.0)
     counts = counts * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))

@@ -67,11 +67,8 @@ def follow(
     pitch = math.asin(clip(float(sole @ up), -1.0, 1.0))
     velocity, from_root = np.asarray(frame.travel_ws), ball - world.pos
     facing = maths.rotate(world.rot, maths.Z)
-    thigh, shin = (
-        frame.knee.pos[leg] - frame.hip.pos[leg],
-        frame.ankle.pos[leg] - frame.knee.pos[leg],
-    )
-    leg_length = length(thigh) + length(shin)
+    at_hip, at_knee, at_ankle = (x.pos[leg] for x in (frame.hip, frame.knee, frame.ankle))
+    leg_length = length(at_knee - at_hip) + length(at_ankle - at_knee)
 
     if before is None:
         flat = across(velocity, up)
