@@ -59,8 +59,8 @@ class Verdict(NamedTuple):
     """m, by which a swinging sole is in the ground at most."""
 
 
-def stepping(step: float) -> Clip:
-    """A straight walk in steps of a length, m, with flat landings and rising heels."""
+def stepping(step: float, toe_off: float = 0.5) -> Clip:
+    """A straight walk in steps, m, with flat landings and heels that rise by an angle, rad."""
     time = np.arange(round(SECONDS * FPS)) / FPS
     speed, cycle = step / STEP_SECONDS, 2.0 * STEP_SECONDS
     feet = []
@@ -70,7 +70,7 @@ def stepping(step: float) -> Clip:
             Foothold(x, x + STANCE * cycle, side * 0.09, speed * (x + 0.5 * STANCE * cycle) + 0.06)
             for x in starts
         ]
-        feet.append(stepping_foot(time, holds, Swing(lift=0.10, toe_off=0.5)))
+        feet.append(stepping_foot(time, holds, Swing(0.10, toe_off)))
     height = 0.89 + 0.015 * np.cos(2.0 * np.pi * (time / STEP_SECONDS - STANCE))
     pelvis = np.stack([np.zeros_like(time), height, speed * time], axis=1)
     body = walker.Body(pelvis, np.zeros_like(time), (feet[0], feet[1]), float(FPS))

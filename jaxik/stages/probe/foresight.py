@@ -29,6 +29,7 @@ GRAVITY = 9.81  # m/s²
 LAST = 0.98  # of a swing, where it waits for a foot that lands late
 CORRECTION = 0.035  # s, half-life with which the fraction of a swing goes to what the pitch says
 SINKING = 0.02  # s, half-life with which it goes to what the height of the sole says
+LONGER = 1.25  # times the rest of a swing by its height and motion, where its pitch tells, too
 SETTLED = 0.3  # s, half-life with which a foothold follows a standing ball that slides
 NEAR = 0.04  # m, from the last foothold, up to which a foot has not left it
 STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
@@ -267,7 +268,9 @@ def follow_swings(
     A swing goes on with time. Once the toes of one who walks have pointed down most, the pitch of
     the sole says how far it is, since the sole turns evenly until it is level again; from then on
     the swing goes on at the pace that it had. Toes of one who runs or walks backwards point down
-    most at other times; there the height of the sole, once it sinks, says when it lands.
+    most at other times, and some soles stay level; there the height of the sole, once it sinks,
+    says when it lands. Where the pitch tells, too, a swing is taken to be further than that only if
+    both the height of the sole and the speed of the ball say so.
 
     At first a foot is expected as far ahead of its hip as it will be when it lands, later where its
     own motion takes it, which slows down as a minimum-jerk motion does (Flash and Hogan 1985). For
@@ -310,11 +313,13 @@ def follow_swings(
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
     walks = _walks(feet, velocity)
     by_time = before.fraction + dt * pace
-    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, walks, dt)
+    pitched = walks * smoothing.clip_to_one(-lowest / PITCHED)
+    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, pitched, dt)
     duration = _duration(time, fraction, swing_time)
-    fraction = _sunk(feet, before, fraction, duration, 1.0 - walks, dt)
+    by_motion = _fraction_of_motion(time, travelled, moved, dt)
+    fraction = _sunk(feet, before, fraction, duration, by_motion, pitched, dt)
     fraction = jnp.where(now.started, fraction, guess.fraction)
-    by_motion = _fraction_of_motion(time, travelled, moved, dt) - fraction
+    by_motion -= fraction
     farthest = jnp.asarray(FARTHEST, dt.dtype)
     by_motion = gate.clip(by_motion, -farthest, farthest, band=FRACTION_BAND)
     counts = before.whole * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
@@ -409,10 +414,9 @@ def _walks(feet: Feet, velocity_ws: Array) -> Float[Array, " legs"]:
 
 
 def _turned(
-    before: Array, by_time: Array, pitch: Array, lowest: Array, walks: Array, dt: Array
+    before: Array, by_time: Array, pitch: Array, lowest: Array, pitched: Array, dt: Array
 ) -> Array:
     """How far each swing is, by time and by the pitch of its sole; it never goes back."""
-    pitched = walks * smoothing.clip_to_one(-lowest / PITCHED)
     turned = smoothing.smoothstep((pitch - lowest) / TURN)
     latest = LAST - pitched * (1.0 - turned) * (LAST - TOES_DOWN)
     fraction = jnp.where(by_time < latest, by_time, latest)
@@ -426,17 +430,26 @@ def _turned(
 
 
 def _sunk(
-    feet: Feet, before: Swings, fraction: Array, duration: Array, counts: Array, dt: Array
+    feet: Feet,
+    before: Swings,
+    fraction: Array,
+    duration: Array,
+    by_motion: Array,
+    pitched: Array,
+    dt: Array,
 ) -> Array:
     """How far each swing is, also by how fast its sole sinks to the animation's floor.
 
     It is taken to need half as long again as at that speed: soles that slow down evenly need twice
-    as long, those of people hardly slow down before they land.
+    as long, those of people hardly slow down before they land. As far as its pitch tells of the
+    swing, the sign that says less counts, height or motion, with a quarter more time left.
     """
     left = 1.5 * dt * feet.height
     sunk = duration * vec.dot(before.from_root_ws - feet.from_root_ws, feet.up_ws)
     by_height = jnp.where(sunk > left, LAST - LAST * vec.safe_divide(left, sunk), 0.0)
-    counts = counts * smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
+    both = jnp.where(by_height < by_motion, by_height, by_motion)
+    by_height = smoothing.lerp(by_height, 1.0 - LONGER * (1.0 - both), pitched)
+    counts = smoothing.smoothstep((fraction - EARLY) / (0.5 * EARLY))
     counts *= smoothing.fraction_of_half_life(jnp.asarray(SINKING, dt.dtype), dt)
     further = by_height - fraction
     return fraction + counts * jnp.where(further > 0, further, 0.0)

@@ -96,16 +96,19 @@ def follow(
         ahead = maths.unit(across(sole, up), facing)
         back = smooth01(-float(flat @ ahead) / math.sqrt(GRAVITY * leg_length) / 0.1)
         walks = (1.0 - runs) * (1.0 - back)
-        fraction = turned(before, dt, pitch, lowest, usual, walks)
+        pitched = clip(-lowest / 0.5, 0.0, 1.0) * walks
+        fraction = turned(before, dt, pitch, lowest, usual, pitched)
+        at_speed = by_motion(time, travelled, moved, dt)
         over_floor = float(from_root @ up) - ball_height
         lowest_point = max(min(over_floor, over_floor - math.sin(pitch) * rig.foot), 0.0)
         sinking = float((before.ball_from_root - from_root) @ up) / dt
         if sinking > 0:
             rest = 1.5 * lowest_point / sinking / duration(time, fraction, usual)
-            share = (1.0 - walks) * smooth01((fraction - 0.3) / 0.15)
-            share *= maths.fraction_of_half_life(0.02, dt)
-            fraction += share * max(LAST * (1.0 - rest) - fraction, 0.0)
-        beyond = clip(by_motion(time, travelled, moved, dt) - fraction, -0.15, 0.15)
+            sunk = max(LAST * (1.0 - rest), 0.0)
+            both = 1.0 - 1.25 * (1.0 - min(sunk, at_speed))
+            share = smooth01((fraction - 0.3) / 0.15) * maths.fraction_of_half_life(0.02, dt)
+            fraction += share * max(lerp(sunk, both, pitched) - fraction, 0.0)
+        beyond = clip(at_speed - fraction, -0.15, 0.15)
         beyond *= 0.6 * before.whole * smooth01((fraction - 0.3) / 0.15)
         correction = maths.fraction_of_half_life(0.035, dt)
         further, whole = lerp(before.further, beyond, correction), before.whole
@@ -186,10 +189,9 @@ def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
 
 
 def turned(
-    before: Swing, dt: float, pitch: float, lowest: float, usual: float, walks: float
+    before: Swing, dt: float, pitch: float, lowest: float, usual: float, pitched: float
 ) -> float:
-    """How far the swing is, by time and, of one who walks ahead, by the pitch of the sole."""
-    pitched = clip(-lowest / 0.5, 0.0, 1.0) * walks
+    """How far the swing is, by time and, so far as it counts, by the pitch of the sole."""
     back = smooth01((pitch - lowest) / 0.05)
     latest = LAST - pitched * (1.0 - back) * (LAST - TOES_DOWN)
     lasts = duration(before.time, before.fraction, usual)
