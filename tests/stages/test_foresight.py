@@ -234,3 +234,21 @@ def test_strides_have_equal_and_finite_derivatives_in_forward_and_reverse_mode(m
     velocity_ws = moves * frames_of().velocity_ws[20:60:2]
     jacobian = finite_jacobian(next_footholds, np.array([0.65, 0.55]), velocity_ws, 1.0 - moves)
     assert (np.abs(jacobian[:, 1]).max() > 1e-3) == moves
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ahead", "slides"),
+    [(-0.06, 0.0), (-0.02, -1.0), (0.01, 1.0), (0.05, 0.0), (0.3, 0.0)],
+    ids=["before the step", "toes in the step", "toes over its edge", "ball over it", "on it"],
+)
+def test_a_foot_that_landed_where_hardly_anything_holds_it_slides_by_a_tenth(ahead, slides):
+    """The foot comes from a swing, its ball so far ahead of the edge of the step, m."""
+    frame = at(frames_of(), slice(0, 1))
+    ball = frame.world_from_model.apply(frame.pose.toe.pos)[0, 0]
+    moved = frame.translated(jnp.array([0.0, 0.0, 0.3 + ahead]) - ball * jnp.array([0.0, 0.0, 1.0]))
+    frames = jax.tree.map(lambda x: jnp.repeat(x, 30, 0), moved)
+    frames = dataclasses.replace(frames, velocity_ws=0.0 * frames.velocity_ws)
+    moves = np.asarray(foreseen(PREDICTED, frames, started=True)[1].moved_ws)[:, 0, 2]
+    assert 0.2 * abs(slides) * 0.026 >= abs(moves[0])
+    assert_close(moves[-1], 0.026 * slides, 1e-3)

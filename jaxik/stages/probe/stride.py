@@ -26,6 +26,8 @@ from .swing import FAR, Level, s_curve
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAYS = 2.0  # of a sole, that other ground has to support more than that to which a foot swings
+AT_EDGE = 0.3  # of a sole, that a place costs whose ball is at an edge: predictions are not exact
+HOLDS = 0.3  # of a sole, with which ground holds a foot that stands on it
 SOONEST, LATEST = 0.06, 0.2  # s, in which a foot slides to what holds it better
 # How far beyond a predicted foothold a foot lands, in parts of the way that it has left: near the
 # median and the quantiles of 10, 30, 70 and 90 % half-way through 63 swings of two people on uneven
@@ -158,6 +160,9 @@ class StrideProbe(AbstractSupportedProbe):
     ) -> foresight.Plan:
         """Where each foot will stand; late in its swing it keeps to the tread that it goes to.
 
+        A foot that lands where hardly anything holds it, as a swing may end before it is expected
+        to, slides on to what does.
+
         Args:
             now: the frame.
             feet: what it shows.
@@ -170,33 +175,41 @@ class StrideProbe(AbstractSupportedProbe):
         inputs = Inputs(feet.rig, now.terrain, feet.frame, now.gate)
         level, plan = Level.of(inputs), before.plan
         planted, stood = swings.planted > 0.5, before.swings.planted > 0.5
-        swings_on, lands = now.started & ~planted & ~stood, now.started & planted & ~stood
+        swings_on, rests = now.started & ~planted & ~stood, now.started & planted
+        lands = rests & ~stood
         origin = vec.dot(level.origin_ws, level.up_ws)
+        # Where the foot stands or stood, from its animated foothold.
+        there_ws = jnp.where((planted == stood)[:, None], plan.last_ws, plan.moved_ws)
+        there_ws = jnp.where(now.started, there_ws, 0.0)
         sure = jnp.where(planted, 1.0, sure)
-        tread = Tread(plan.height - origin, jnp.where(swings_on, STAYS * sure, 0.0))
-        supports = self.better_support(
+        tread = Tread(
+            plan.height - origin,
+            jnp.where(swings_on, STAYS * sure, 0.0),
+            jnp.where(rests, 0.0, AT_EDGE),
+        )
+        least = {"min_sole": jnp.where(rests, HOLDS, self.min_sole)}
+        supports = dataclasses.replace(self, **least).better_support(
             inputs,
             level,
-            place_ws[None],
+            (place_ws + jnp.where(rests[:, None], there_ws, 0.0))[None],
             feet.ahead_ws[None],
             feet.foot_height,
             jnp.ones_like(sure),
             tread,
         )
         support = jax.tree.map(lambda x: x[0], supports)
-        slide = sure * support.slide
-        jump = plan.left.value + plan.slide - slide
+        slide = jnp.where(rests & stood, 0.0, sure * support.slide)
+        jump = jnp.where(lands, 0.0, plan.left.value + plan.slide) - slide
         time = jnp.where(until > LATEST, LATEST, jnp.where(until < SOONEST, SOONEST, until))
         left = settle(plan.left._replace(value=jump), time, now.dt)
-        left = Deviation(*(jnp.where(swings_on, x, 0.0) for x in left))
+        left = Deviation(*(jnp.where(swings_on | rests, x, 0.0) for x in left))
 
-        first_ws = vec.scale(feet.ahead_ws, jnp.where(planted, slide, 0.0))
-        last_ws = jnp.where(lands[:, None], plan.moved_ws, plan.last_ws)
-        last_ws = jnp.where(now.started, last_ws, first_ws)
-        last_share = jnp.where(lands, plan.share, plan.last_share)
-        last_share = jnp.where(now.started, last_share, support.share)
-        next_ws = vec.scale(feet.ahead_ws, slide + left.value)
-        moved_ws = lerp(last_ws, next_ws, self._eased(swings.fraction)[..., None])
+        slide_ws, left_ws = vec.scale(feet.ahead_ws, slide), vec.scale(feet.ahead_ws, left.value)
+        last_ws = there_ws + jnp.where(planted[:, None], slide_ws, 0.0)
+        moved_ws = last_ws + jnp.where(planted[:, None], left_ws, 0.0)
+        moved_ws = lerp(moved_ws, slide_ws + left_ws, self._eased(swings.fraction)[..., None])
+        last_share = jnp.where(now.started & ~lands, plan.last_share, support.share)
+        slide = jnp.where(planted, 0.0, slide)
         height = support.height + origin
         return foresight.Plan(last_ws, slide, left, moved_ws, height, support.share, last_share)
 

@@ -27,7 +27,6 @@ SLIDE_COST = 0.15  # of the sole that a slide by the whole of it has to gain
 AHEAD = 0.1  # tenths of the sole, by which a place ahead counts as nearer: no two are equal
 TOO_FAR = 6.0  # of the sole, more than any slide gains
 FIFTH = 0.2  # of the sole, over which slides become too far
-AT_EDGE = 0.3  # of the sole, that a place costs whose ball is at an edge: predictions are not exact
 SHARE_BAND = 0.01  # of the sole
 SAME_TREAD = 0.02  # m, from the height of a tread, within which ground is that tread
 
@@ -40,6 +39,8 @@ class Tread:
     """m, over the character's level."""
     preferred: Float[Array, " legs"]
     """How much more of a sole other ground has to support."""
+    at_edge: Float[Array, " legs"]
+    """Of the sole, that a place costs whose ball is at an edge."""
 
 
 @struct
@@ -169,7 +170,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             off = jnp.abs(at(heights) - tread.height)
             elsewhere = smoothstep((off - SAME_TREAD) / SAME_TREAD)
             cost += tread.preferred * (1.0 - at(firm) * (1.0 - elsewhere))
-            cost += AT_EDGE * (1.0 - inside)
+            cost += tread.at_edge * (1.0 - inside)
         (cost,) = vec.stacked_barrier(cost)
         places = cost, slide, at(firm) * share, at(heights)
 
