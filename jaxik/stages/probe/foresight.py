@@ -127,7 +127,7 @@ class Plan:
     slide: Float[Array, " legs"]
     """m, ahead, from where the animated foot will stand to the next."""
     left: smoothing.Deviation
-    """m, m/s and m/s² (legs), what is left of the jumps of that; in a stance, of the last foothold."""
+    """m, m/s and m/s² (legs), what is left of the jumps of that; of `last_ws` in a stance."""
     moved_ws: Float[Array, "legs 3"]
     """m, of the foot in this frame from the animated foot."""
     height: Float[Array, " legs"] = place("leg height")
