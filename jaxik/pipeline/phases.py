@@ -18,8 +18,9 @@ from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.leg import LegGoal
 from jaxik.stages.pelvis import PelvisMoment
 from jaxik.stages.probe import foot_heading
+from jaxik.stages.warp import about_up, with_turned_feet, with_turned_pelvis
 from jaxik.world import places
-from jaxik.world.frame import Contact, Sensed, Stride, animated_ankles
+from jaxik.world.frame import Contact, Sensed, Stride, Turn, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
@@ -42,7 +43,7 @@ def solve(frames: AbstractFrames) -> tuple[State, Result]:
     return after, frames.each(pose, sensed, advanced, frames.faults)
 
 
-def watch(ik: FootIK, inputs: Inputs, contact: Contact, turn: Array | None) -> PyTree:
+def watch(ik: FootIK, inputs: Inputs, contact: Contact, turn: Turn | None) -> PyTree:
     """What the memory of the probe advances with; None if it has none."""
     if not jax.tree.leaves(ik.probe.init(inputs.rig)):
         return None  # and no stride is scaled in vain
@@ -50,17 +51,17 @@ def watch(ik: FootIK, inputs: Inputs, contact: Contact, turn: Array | None) -> P
 
 
 def _warped(
-    ik: FootIK, inputs: Inputs, turn: Array | None
+    ik: FootIK, inputs: Inputs, turn: Turn | None
 ) -> tuple[Inputs, Float[Array, "legs 3"] | None]:
     """The frame with its feet moved for the character's velocity, and by how much, m.
 
-    Feet that are turned by `turn`, rad, move from where the turned pelvis carries them.
+    Feet that are turned move from where the turned pelvis carries them.
     """
     before_ws = None
     if turn is not None:
-        carried = ik.warp.with_turned_pelvis(inputs.frame, turn)
+        carried = with_turned_pelvis(inputs.frame, turn)
         before_ws = animated_ankles(carried).pos
-        turned = ik.warp.with_turned_feet(carried, inputs.bearing, turn)
+        turned = with_turned_feet(carried, inputs.bearing, turn)
         inputs = dataclasses.replace(inputs, frame=turned)
     warp_ws = ik.warp.offset(inputs)
     if warp_ws is not None:
@@ -75,7 +76,7 @@ def sense(
     inputs: Inputs,
     contact: Contact,
     rise: Float[Array, ""],
-    turn: Float[Array, ""] | None,
+    turn: Turn | None,
     stride: Stride | None,
 ) -> Sensed:
     """Outputs of the stages that need no memory.
@@ -85,7 +86,7 @@ def sense(
         inputs: the frame.
         contact: which feet stand.
         rise: of the root, m.
-        turn: of the feet about the root's up, rad; None for none.
+        turn: of pelvis and feet; None for none.
         stride: where the feet stood and will stand; None leaves what the animation says.
     """
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
@@ -218,9 +219,9 @@ def pose(
         level = functools.partial(jnp.where, faults.frame, quat.identity(offset_ws.dtype))
         rot_ws = level(rot_ws)
         spine_ws, head_ws = (None if rot is None else level(rot) for rot in (spine_ws, head_ws))
-        turn = None if turn is None else jnp.where(faults.frame, 0.0, turn)
+        turn = jax.tree.map(functools.partial(jnp.where, faults.frame, 0.0), turn)
     if turn is not None:
-        frame = ik.warp.with_turned_pelvis(frame, turn)
+        frame = with_turned_pelvis(frame, turn)
         inputs = dataclasses.replace(inputs, frame=frame)
     body = body_transform(inputs, rot_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
@@ -236,7 +237,7 @@ def pose(
     )
     twist = None
     if turn is not None:
-        pelvis = ik.warp.pelvis_turn(turn)
+        pelvis = about_up(turn.pelvis)
         twist = body.turn_rot(quat.conjugate(pelvis.rot))  # about the up of the body as it leans
         body = body @ pelvis
     corrections = Corrections(

@@ -5,9 +5,10 @@ from abc import abstractmethod
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxik.maths import smoothing, vec
+from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, half_life, length
 from jaxik.maths.struct import struct
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
 
 from .inputs import SensedMoment
@@ -60,8 +61,9 @@ class FootSeparation(AbstractSeparation):
 
     Locks and scaled strides can bring feet nearer to each other than the animation does. With x to
     the left, a left foot i and a right foot j are short of `min(distance, a_i - a_j) - (x_i - x_j)`
-    where a is the animation and x the foothold with its lock. So no pair of feet is asked to be
-    further apart than animated: legs that the animation crosses stay crossed.
+    where a is the animation and x the foothold with its lock, whose left turns with strides that
+    are turned. So no pair of feet is asked to be further apart than animated: legs that the
+    animation crosses stay crossed.
 
     The swinging foot of a pair gives way by as much as is missing, two swinging feet share it.
     Where several feet are near, the largest move counts. Feet that stand or are locked do not move:
@@ -86,13 +88,13 @@ class FootSeparation(AbstractSeparation):
         self, now: SensedMoment, foothold_ws: Array, hold: Hold, state: SeparationState
     ) -> tuple[SeparationState, Float[Array, "legs 3"]]:
         sensed, side = now.sensed, now.sensed.side
-        left_ws = -sensed.slope.right_ws
+        left_ws, animated_left_ws = _lefts(sensed)
         before = sensed.carry.turn(state.offset_ws)
         held = 1.0 - (1.0 - hold.locked) * (1.0 - sensed.contact.weight)
 
         kept = held * vec.dot(before, left_ws)
         placed = vec.dot(foothold_ws + hold.offset_ws, left_ws)
-        animated = vec.dot(sensed.unscaled_ankle_ws, left_ws)
+        animated = vec.dot(sensed.unscaled_ankle_ws, animated_left_ws)
         wanted = now.gate.clip(
             _apart(animated, animated, side),
             jnp.asarray(-jnp.inf, side.dtype),
@@ -121,6 +123,16 @@ class FootSeparation(AbstractSeparation):
         )
         climb = -sensed.foothold.found * vec.dot(offset, normal) / facing
         return SeparationState(offset), offset + vec.scale(up, climb)
+
+
+def _lefts(sensed: Sensed) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """To the left of the feet, and of the animation on its turned pelvis, unit, world space."""
+    left_ws = -sensed.slope.right_ws
+    if sensed.turn is None:
+        return left_ws, left_ws
+    turns = jnp.stack([sensed.turn.feet, sensed.turn.pelvis])
+    feet_ws, pelvis_ws = quat.rotate(quat.from_axis_angle(sensed.up_ws, turns), left_ws)
+    return feet_ws, pelvis_ws
 
 
 def _apart(x: Array, others: Array, side: Array) -> Float[Array, "legs legs"]:

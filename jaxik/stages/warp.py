@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, angle, duration, ratio
 from jaxik.maths.smoothing import clip_to_one, fraction_of_half_life, lerp
-from jaxik.world.frame import UP, Frame, heading
+from jaxik.world.frame import UP, Frame, Turn, heading
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import Inputs, Moment
@@ -80,30 +80,13 @@ class StrideWarp(Rule):
 
     def advance(
         self, now: Moment, goal: Float[Array, ""] | None, state: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
-        """Memory after this frame, and the feet's turn, rad."""
+    ) -> tuple[Float[Array, ""], Turn | None]:
+        """Memory after this frame, and how the body is turned."""
         if goal is None:
             return state, None
         fraction = now.progress(fraction_of_half_life(self.half_life, now.dt))
         turn = lerp(state, goal, fraction)
-        return turn, turn
-
-    def pelvis_turn(self, turn: Float[Array, ""]) -> Transform:
-        """The pelvis' motion in model space, where the feet turn by `turn`, rad."""
-        return _about_up(self.pelvis_share * turn)
-
-    def with_turned_pelvis(self, frame: Frame, turn: Float[Array, ""]) -> Frame:
-        """The single frame with its legs on the turned pelvis."""
-        legs = frame.weight.shape[-1]
-        pose = frame.pose.transformed(self.pelvis_turn(turn).repeat(legs))
-        return dataclasses.replace(frame, pose=pose)
-
-    def with_turned_feet(self, frame: Frame, bearing: Array, turn: Float[Array, ""]) -> Frame:
-        """The single frame on its turned pelvis, with feet that bear turned all the way."""
-        rest = _about_up((1.0 - self.pelvis_share) * turn * bearing * jnp.ones_like(frame.weight))
-        pose = frame.pose
-        pose = dataclasses.replace(pose, ankle=rest @ pose.ankle, toe=rest @ pose.toe)
-        return dataclasses.replace(frame, pose=pose)
+        return turn, Turn(self.pelvis_share * turn, turn)
 
     def offset(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
         """How far each foot moves, m, world space; None, which costs nothing, where none does."""
@@ -126,7 +109,22 @@ class StrideWarp(Rule):
         return vec.scale(scaled, scale - 1.0)
 
 
-def _about_up(turn: Float[Array, "*b"]) -> Transform:
+def with_turned_pelvis(frame: Frame, turn: Turn) -> Frame:
+    """The single frame with its legs on the turned pelvis."""
+    legs = frame.weight.shape[-1]
+    pose = frame.pose.transformed(about_up(turn.pelvis).repeat(legs))
+    return dataclasses.replace(frame, pose=pose)
+
+
+def with_turned_feet(frame: Frame, bearing: Array, turn: Turn) -> Frame:
+    """The single frame on its turned pelvis, with feet that bear turned all the way."""
+    rest = about_up((turn.feet - turn.pelvis) * bearing * jnp.ones_like(frame.weight))
+    pose = frame.pose
+    pose = dataclasses.replace(pose, ankle=rest @ pose.ankle, toe=rest @ pose.toe)
+    return dataclasses.replace(frame, pose=pose)
+
+
+def about_up(turn: Float[Array, "*b"]) -> Transform:
     """Turns about the root's up, model space, by these angles, rad."""
     up = vec.constant(UP, turn)
     return Transform(jnp.zeros((*turn.shape, 3), turn.dtype), quat.from_axis_angle(up, turn))

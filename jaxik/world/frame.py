@@ -231,6 +231,16 @@ class Slope:
 
 
 @struct
+class Turn:
+    """By how much a body is turned about its root's up, positive to the left."""
+
+    pelvis: Float[Array, ""]
+    """rad."""
+    feet: Float[Array, ""]
+    """rad, all in all."""
+
+
+@struct
 class Sensed:
     """What the stages derive from one frame without memory of earlier ones."""
 
@@ -275,8 +285,8 @@ class Sensed:
     warp_ws: Float[Array, "legs 3"] | None = None
     """m, by which scaled and turned strides move the ankles from the animation on the turned
     pelvis; they have moved already. None for none."""
-    turn: Float[Array, ""] | None = None
-    """rad, by which the feet are turned about the root's up; None for not at all."""
+    turn: Turn | None = None
+    """Of a character that moves in another direction than its animation."""
 
     @property
     def bearing(self) -> Float[Array, "*legs"]:

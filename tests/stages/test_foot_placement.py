@@ -21,7 +21,7 @@ from jaxik.stages.foot import KeepFoot, SolvedFoot
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.stages.leg import LegGoal, TwoBone
 from jaxik.stages.probe import FootProbe, StrideProbe
-from jaxik.stages.warp import StrideWarp
+from jaxik.stages.warp import StrideWarp, with_turned_feet, with_turned_pelvis
 from jaxik.world import terrain
 from jaxik.world.frame import Contact, Frame, GroundHits, Rays, Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
@@ -242,10 +242,10 @@ def turned(rule, orientation, grounded, weight, points, bearing, gate: AbstractG
         state, turn = rule.advance(
             Moment(jnp.asarray(DT, points.dtype), started, gate), goal, state
         )
-        carried = rule.with_turned_pelvis(frame, turn)
-        feet = rule.with_turned_feet(carried, bearing, turn)
+        carried = with_turned_pelvis(frame, turn)
+        feet = with_turned_feet(carried, bearing, turn)
         places = feet.pose.hip.pos, feet.pose.ankle.pos, feet.pose.toe.rot
-        return (state, jnp.ones_like(started)), (turn, *places)
+        return (state, jnp.ones_like(started)), (turn.feet, *places)
 
     start = rule.init(rig), jnp.zeros((), bool)
     return jax.lax.scan(frame, start, (orientation, grounded, weight, points, bearing))[1]

@@ -26,9 +26,9 @@ from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.lean import SpineLean
 from jaxik.stages.lock import Hold
 from jaxik.stages.separation import FootSeparation
-from jaxik.stages.warp import StrideWarp
+from jaxik.stages.warp import StrideWarp, about_up
 from jaxik.world import terrain
-from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, Sensed, Slope
+from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, Sensed, Slope, Turn
 from jaxik.world.skeleton import LegPose, Rig, Still, Transform
 from jaxik.world.terrain import Hit, Terrain
 from reference import maths
@@ -173,7 +173,7 @@ APART = {"distance": 0.15, "half_life": 0.05}
 RULE = FootSeparation(**APART)
 
 
-def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=HARD):
+def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=HARD, turn=None):
     """How far the feet of a clip move (frames legs 3), m; `offsets` are those of the locks."""
     dtype = animated.dtype
     up = jnp.asarray([0.0, 1.0, 0.0], dtype)
@@ -182,6 +182,7 @@ def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=H
         state, started = carry
         ankle, offset, locked, contact, weight, normal, yaw = inputs
         right = jnp.stack([-jnp.cos(yaw), jnp.zeros_like(yaw), jnp.sin(yaw)])
+        warp = None if turn is None else ankle - about_up(turn.pelvis - turn.feet).turn(ankle)
         sensed = fragment(
             Sensed,
             slope=fragment(Slope, right_ws=right),
@@ -190,7 +191,8 @@ def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=H
             side=jnp.asarray(SIDES, dtype),
             weight=weight,
             ankle_ws=ankle,
-            warp_ws=None,
+            warp_ws=warp,
+            turn=turn,
             ground=fragment(GroundHits, ankle=fragment(Hit, normal=normal)),
             foothold=fragment(Foothold, found=jnp.ones_like(weight)),
             up_ws=up,
@@ -253,6 +255,17 @@ def test_legs_that_only_the_animation_crosses_stay_as_animated():
     for feet in (animated, crossed):
         moved = moves_of(RULE, feet, still, locked, contact, weight, normals, yaw)
         np.testing.assert_array_equal(moved, 0.0)
+
+
+def test_feet_of_turned_strides_give_way_along_them_as_they_do_unturned():
+    animated, offsets, *rest, normals, yaw = stroll()
+    expected = moves_of(RULE, animated, offsets, *rest, normals, yaw)
+    turn = Turn(pelvis=jnp.asarray(0.5), feet=jnp.asarray(1.3))
+    rot = Rotation.from_rotvec([0.0, 1.3, 0.0])
+    turned = ((x @ rot.as_matrix().T) for x in (animated, offsets, normals, np.asarray(expected)))
+    animated, offsets, normals, expected = turned
+    moved = moves_of(RULE, animated, offsets, *rest, normals, yaw, turn=turn)
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
 
 
 def test_standing_feet_keep_the_place_where_they_came_down():
