@@ -338,7 +338,7 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
 
 def test_the_spine_turns_back_what_the_pelvis_turns_and_the_feet_turn_further():
     result, frames = result_of("adult"), wander()
-    turn, root = np.asarray(result.trace.sensed.turn), frames.world_from_model.rot
+    turn, root = np.asarray(result.trace.sensed.turn.feet), frames.world_from_model.rot
     assert np.abs(turn).max() > 0.2
     sin = np.sin(0.25 * turn)
     np.testing.assert_allclose(np.asarray(result.corrections.twist)[:, 2], -sin, atol=0.02)

@@ -17,7 +17,7 @@ from fitting.synthetic import actions, walker
 from stairs import grounds
 from stairs.__main__ import BOUNDS
 from stairs.flights import Flight, field_of, sample
-from stairs.walks import SETTLED, Verdict, stepping, walked
+from stairs.walks import SETTLED, Verdict, placed, solve, stepping, walked
 from support.experiments import ROOT
 
 
@@ -48,8 +48,25 @@ def test_feet_stand_on_treads_that_nothing_foretells():
     pairs = walked(jaxik.presets.stride(foretold=False), chosen, known=False)
     verdicts = np.array([verdict for _, verdict in pairs])
     share = (verdicts <= np.array(BOUNDS)).mean(0)
-    assert (share >= Verdict(off=0.99, pop=0.96, dip=0.96, bend=0.85, sunk=1.0)).all()
+    assert (share >= Verdict(off=0.985, pop=0.96, dip=0.96, bend=0.85, sunk=1.0)).all()
     assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.10]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False], ids=["foretold", "not foretold"])
+def test_a_body_sinks_to_lower_stairs_no_faster_than_it_falls(known):
+    """At 30 Hz, over its animation: captured pelves come to 1.2 g."""
+    rng, falls = np.random.default_rng(0), []
+    for flight in [sample(rng, field=True) for _ in range(60)]:
+        frames, level = placed(flight)
+        stride = replace(frames.stride, known=known * frames.stride.known)
+        ik = jaxik.presets.stride(foretold=known)
+        hip = solve(ik, flight, replace(frames, stride=stride)).hip[..., 1].mean(1)
+        world, animated = level.world_from_model, np.asarray(level.pose.hip.pos)[..., 1].mean(1)
+        rise = hip - animated - np.asarray(world.pos)[:, 1]
+        bends = (rise[4:] - 2.0 * rise[2:-2] + rise[:-4]) * 30.0**2
+        falls.append(-bends[SETTLED:-SETTLED].min() / 9.81)
+    assert 0.5 < max(falls) < 1.3
 
 
 def off_ground(clip: Clip, ground: grounds.Ground) -> float:

@@ -135,6 +135,7 @@ class Solved(NamedTuple):
     ankle: np.ndarray
     soles: np.ndarray
     """Below ankle and ball, (frames legs 2 3)."""
+    hip: np.ndarray
 
 
 def solve(ik: jaxik.FootIK, flight: Flight, frames: jaxik.Frame) -> Solved:
@@ -148,14 +149,16 @@ def solve(ik: jaxik.FootIK, flight: Flight, frames: jaxik.Frame) -> Solved:
     world = jaxik.Transform(
         frames.world_from_model.pos[:, None], frames.world_from_model.rot[:, None]
     )
-    ankle, toe = world.apply(result.pose.ankle.pos), world.apply(result.pose.toe.pos)
+    hip, ankle, toe = (
+        world.apply(joint.pos) for joint in (result.pose.hip, result.pose.ankle, result.pose.toe)
+    )
     foot = quat.multiply(result.pose.ankle.rot, clip.rig.ankle_from_foot)
     up = quat.rotate(
         world.rot, quat.rotate(foot, jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), ankle.shape))
     )
     heel = ankle - vec.scale(up, rig_heights()[0])
     ball = toe - vec.scale(up, rig_heights()[1])
-    return Solved(np.asarray(ankle), np.stack([heel, ball], 2))
+    return Solved(np.asarray(ankle), np.stack([heel, ball], 2), np.asarray(hip))
 
 
 @functools.cache

@@ -26,6 +26,8 @@ class Approach:
 
     fraction: Float[Array, " legs"]
     """0..1, time of each swing that has passed."""
+    speed: Float[Array, ""]
+    """m/s, at which root and offset rose over the ground together."""
     root_height: Float[Array, ""] = place("height")
     """Metres."""
 

@@ -42,6 +42,7 @@ from .base import (
 )
 
 EARLIEST = 10.0  # landing times before a landing; its share is then less than numbers resolve
+GRAVITY = 9.81  # m/s²
 FASTEST = 2.0  # m/s, of a root that climbs; one that is faster has jumped
 
 
@@ -72,8 +73,11 @@ class AbstractFollowingPelvis(AbstractPelvis):
     ) -> Goal:
         """Where to go; to the height `resting`, m, if no foot requests one."""
 
-    def highest_rise(self, now: PelvisMoment, state: PelvisState) -> Array | None:
-        """How far the body can rise from its animation in this frame, m; None for any height."""
+    def rise_bounds(self, now: PelvisMoment, state: PelvisState) -> tuple[Array, Array] | None:
+        """How far the body rises over its animation in this frame, m, at least and at most.
+
+        Below 0 it sinks; None is without bounds.
+        """
         return None
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
@@ -94,12 +98,13 @@ class AbstractFollowingPelvis(AbstractPelvis):
             now.dt,
             self.spring,
         )
-        risen = self.highest_rise(now, state)
-        if risen is not None:
-            highest = jnp.where(now.started, state.height + risen, height)
-            pushed = vec.safe_divide(risen, now.dt)
-            velocity = jnp.where(height > highest, pushed, velocity)
-            height = jnp.where(height > highest, highest, height)
+        bounds = self.rise_bounds(now, state)
+        if bounds is not None:
+            risen, (least, most) = height - state.height, bounds
+            bounded = jnp.where(risen > most, most, jnp.where(risen < least, least, risen))
+            outside = now.started & ((risen > most) | (risen < least))
+            velocity = jnp.where(outside, vec.safe_divide(bounded, now.dt), velocity)
+            height = jnp.where(outside, state.height + bounded, height)
         height = smoothing.lerp(state.height, height, now.awake)
         ahead = smoothing.lerp(state.ahead, goal.ahead, now.awake * now.progress(rising))
         after = PelvisState.at(height, goal.height, sensed.up_ws)
@@ -165,7 +170,8 @@ class ReachPelvis(AbstractFollowingPelvis):
     Once a trailing leg has left the ground, it limits the body no more, but a person is not up at
     once: the upper leg pushes. A captured climb of 45 cm takes 0.6 s, at a nearly constant speed.
     So body and root together rise no faster than `rise_speed` and 0.75, the steepness of steep
-    stairs, of the speed of the character, as long as the root does not by itself.
+    stairs, of the speed of the character, as long as the root does not by itself. Nor do they fall
+    over the ground faster than freely, which no captured pelvis does.
     """
 
     highest_share: Leaf = ratio(
@@ -207,23 +213,31 @@ class ReachPelvis(AbstractFollowingPelvis):
         scale="log",
     )
 
-    def highest_rise(self, now: PelvisMoment, state: PelvisState) -> Array | None:
+    def rise_bounds(self, now: PelvisMoment, state: PelvisState) -> tuple[Array, Array] | None:
         landing, before = now.sensed.ground.landing, state.approach
         if landing is None or before is None:
             return None
+        climbed = _climbed(now, landing, before)
         pushed = (self.rise_speed + STAIRS * vec.length(landing.velocity_ws[0])) * now.dt
-        rest = pushed - HARD.minimum(_climbed(now, landing, before), band=0.0)
-        return jnp.where(rest > 0, rest, 0.0)
+        most = pushed - HARD.minimum(climbed, band=0.0)
+        sinking = jnp.where(before.speed < 0, before.speed, 0.0)
+        least = (sinking - GRAVITY * now.dt) * now.dt - HARD.maximum(climbed, band=0.0)
+        return least, jnp.where(most > 0, most, 0.0)
 
     def init(self, rig: Rig) -> PelvisState:
         zero = jnp.zeros_like(rig.side)
-        return dataclasses.replace(super().init(rig), approach=Approach(zero, zero[0]))
+        return dataclasses.replace(super().init(rig), approach=Approach(zero, zero[0], zero[0]))
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
-        landing, approach = now.sensed.ground.landing, state.approach
-        if landing is not None:
-            approach = Approach(landing.fraction, landing.root_height)
-        return dataclasses.replace(super().advance(now, target, state), approach=approach)
+        after, before = super().advance(now, target, state), state.approach
+        landing = now.sensed.ground.landing
+        if landing is None or before is None:
+            return after
+        climbed = HARD.maximum(_climbed(now, landing, before), band=0.0)
+        speed = vec.safe_divide(after.height - state.height + climbed, now.dt)
+        speed = jnp.where(now.started & (now.dt > 0), speed, before.speed)
+        approach = Approach(landing.fraction, speed, landing.root_height)
+        return dataclasses.replace(after, approach=approach)
 
     def goal(
         self, now: PelvisMoment, target: Transform, state: PelvisState, resting: Array

@@ -337,6 +337,8 @@ class StrideProbe(AbstractSupportedProbe):
         normal = vec.normalize(lerp(level.up_ws, normal, found[..., None]), level.up_ws)
         hit = Hit(ankle_ws, normal, self.ray_up - height, found, platform)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
+        sure = stride.sure if isinstance(stride, foresight.PlannedStride) else stride.known
+        assert sure is not None
         turns = jnp.ones_like(found)
         lift, pitch = found * swing.lift, found * swing.pitch
         end_rise = lerp(plane_rise, least_rise(plane_rise, heel_rises[-1]), heels.found[-1])
@@ -345,7 +347,7 @@ class StrideProbe(AbstractSupportedProbe):
             + vec.scale(level.up_ws, high + end_rise - height),
             velocity_ws=vec.reject(jnp.broadcast_to(frame.velocity_ws, ball.shape), level.up_ws),
             fraction=stride.fraction,
-            certain=stride.known * trust,
+            certain=sure * trust,
             root_height=vec.dot(frame.world_from_model.pos, inputs.terrain.up_ws),
         )
         nothing = no_hit(hit)

@@ -63,6 +63,8 @@ class State:
     pelvis_offset_ws: Array
     fractions: list[float]
     root_height: float
+    rise: float
+    """m/s, at which the body rose over the ground, with its root."""
 
 
 def step(
@@ -129,7 +131,10 @@ def step(
     eased = ground.ease(parameters, "pelvis", state.pelvis if state else None, goal, frame.dt)
     if state is not None and "pelvis.rise_speed" in parameters.values:
         eased = pushed(parameters, eased, state, feet, footholds, terrain.up)
+    rise = 0.0
     if state is not None:
+        rise = (eased.value - state.pelvis.value) / frame.dt
+        rise += max(root_speeds(feet, footholds, terrain.up, state))
         rising = maths.fraction_of_half_life(parameters["pelvis.rise_half_life"], frame.dt)
         ahead = lerp(state.ahead, ahead, rising)
     offset_ws = (terrain.up * eased.value + forward * ahead) * frame.grounded
@@ -170,7 +175,7 @@ def step(
     }
     fractions = [landing.fraction for landing in landings]
     root_height = float(frame.world_from_model.pos @ terrain.up)
-    pelvis = eased, goal, ahead, offset_ws, fractions, root_height
+    pelvis = eased, goal, ahead, offset_ws, fractions, root_height, rise
     return State(standing, followed, holds, leaning, *pelvis), output
 
 
@@ -274,16 +279,24 @@ def pushed(
     footholds: list[Array],
     up: Array,
 ) -> Motion:
-    """The body no higher over its animation than legs push it in a frame, with its root."""
+    """The body no higher than legs push it in a frame, with its root, nor lower than it falls."""
     frame = feet[0].frame
     walking = length(maths.across(frame.travel_ws, feet[0].up))
     speed = parameters["pelvis.rise_speed"] + stride_probe.STAIRS * walking
-    pairs = zip(feet, footholds, strict=True)
-    climbs = [root_speed(foot, foothold, up, state) for foot, foothold in pairs]
-    rise = max(speed - min(climbs), 0.0) * frame.dt
-    if pelvis.value <= state.pelvis.value + rise:
+    climbs = root_speeds(feet, footholds, up, state)
+    highest = state.pelvis.value + max(speed - min(climbs), 0.0) * frame.dt
+    fall = min(state.rise, 0.0) - 9.81 * frame.dt
+    lowest = state.pelvis.value + (fall - max(climbs)) * frame.dt
+    if lowest <= pelvis.value <= highest:
         return pelvis
-    return Motion(state.pelvis.value + rise, rise / frame.dt)
+    height = maths.clip(pelvis.value, lowest, highest)
+    return Motion(height, (height - state.pelvis.value) / frame.dt)
+
+
+def root_speeds(feet: list[Foot], footholds: list[Array], up: Array, state: State) -> list[float]:
+    """How fast the root rises over the ground under each foot, m/s."""
+    pairs = zip(feet, footholds, strict=True)
+    return [root_speed(foot, foothold, up, state) for foot, foothold in pairs]
 
 
 def root_speed(foot: Foot, foothold: Array, up: Array, state: State) -> float:
