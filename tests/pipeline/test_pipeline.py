@@ -15,6 +15,7 @@ import pytest
 import jaxik
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import slots
+from jaxik.stages.pelvis import ReachPelvis
 from reference import maths, sample_poses
 from reference.characters import Frame, Parameters
 from reference.systems import mec, ozz, record, unreal
@@ -267,3 +268,13 @@ def test_a_leg_that_only_pads_a_batch_changes_nothing(name):
 def test_feet_with_different_ups_agree_with_the_reference(values):
     ups = [maths.rotate(tilt, maths.Y) for tilt in TILTS]
     compare("mec", values, scene(stands=True), ups)
+
+
+def test_a_pelvis_that_heeds_landings_serves_probes_that_foresee_none():
+    rig = clips.make_rig()
+    frames = clips.to_frames(clips.wandering(rig, np.random.default_rng(0), 20))
+    ik = dataclasses.replace(jaxik.presets.record(), pelvis=ReachPelvis())
+    run = jax.jit(jaxik.run, compiler_options=QUICK)
+    result = run(ik, clips.to_rig(rig), clips.to_terrain(clips.BROKEN), frames)
+    assert np.abs(result.body.pos[:, 1]).max() > 0.01
+    np.testing.assert_array_equal(result.trace.advanced.state.pelvis.approach.fraction, 0.0)

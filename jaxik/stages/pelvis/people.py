@@ -232,7 +232,7 @@ class ReachPelvis(AbstractFollowingPelvis):
         after, before = super().advance(now, target, state), state.approach
         landing = now.sensed.ground.landing
         if landing is None or before is None:
-            return after
+            return dataclasses.replace(after, approach=before)
         climbed = HARD.maximum(_climbed(now, landing, before), band=0.0)
         speed = vec.safe_divide(after.height - state.height + climbed, now.dt)
         speed = jnp.where(now.started & (now.dt > 0), speed, before.speed)
