@@ -12,6 +12,7 @@ from jaxik.world.frame import Frame, Sensed, bearing
 from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
+GRAVITY = 9.81  # m/s²
 STAIRS = 0.75  # rise over run of the steepest stairs
 
 

@@ -250,5 +250,5 @@ def test_a_foot_that_landed_where_hardly_anything_holds_it_slides_by_a_tenth(ahe
     frames = jax.tree.map(lambda x: jnp.repeat(x, 30, 0), moved)
     frames = dataclasses.replace(frames, velocity_ws=0.0 * frames.velocity_ws)
     moves = np.asarray(foreseen(PREDICTED, frames, started=True)[1].moved_ws)[:, 0, 2]
-    assert 0.2 * abs(slides) * 0.026 >= abs(moves[0])
+    assert abs(moves[0]) <= 0.2 * 0.026 * abs(slides)  # it sets out smoothly
     assert_close(moves[-1], 0.026 * slides, 1e-3)

@@ -21,7 +21,7 @@ from jaxik.maths.parameter_tree import (
     switch,
 )
 from jaxik.maths.struct import struct
-from jaxik.stages.inputs import STAIRS
+from jaxik.stages.inputs import GRAVITY, STAIRS
 from jaxik.world.frame import Landing
 from jaxik.world.skeleton import Rig, Transform, mean_position
 
@@ -42,7 +42,6 @@ from .base import (
 )
 
 EARLIEST = 10.0  # landing times before a landing; its share is then less than numbers resolve
-GRAVITY = 9.81  # m/s²
 FASTEST = 2.0  # m/s, of a root that climbs; one that is faster has jumped
 
 
@@ -171,7 +170,8 @@ class ReachPelvis(AbstractFollowingPelvis):
     once: the upper leg pushes. A captured climb of 45 cm takes 0.6 s, at a nearly constant speed.
     So body and root together rise no faster than `rise_speed` and 0.75, the steepness of steep
     stairs, of the speed of the character, as long as the root does not by itself. Nor do they fall
-    over the ground faster than freely, which no captured pelvis does.
+    over the ground faster than freely: the captured pelvis of a walk over blocks accelerates down
+    by less than 0.9 g in 99.9 % of its frames.
     """
 
     highest_share: Leaf = ratio(

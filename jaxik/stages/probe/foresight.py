@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import place, struct
-from jaxik.stages.inputs import Inputs, Moment
+from jaxik.stages.inputs import GRAVITY, Inputs, Moment
 from jaxik.world.frame import FORWARD, Contact, Frame, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 
@@ -25,7 +25,6 @@ PITCHED = 0.5  # rad, of a sole, from which its pitch tells how far the swing is
 # from which they run (Alexander 1989: from one to the other at 0.5).
 WALKS, RUNS = 0.4, 0.7
 BACK = 0.1  # root of that number from which one walks backwards
-GRAVITY = 9.81  # m/s²
 LAST = 0.98  # of a swing, where it waits for a foot that lands late
 CORRECTION = 0.035  # s, half-life with which the fraction of a swing goes to what the pitch says
 SINKING = 0.02  # s, half-life with which it goes to what the height of the sole says
