@@ -138,16 +138,31 @@ def turning(frame: characters.Frame, n: int) -> characters.Frame:
 
 def by_reference(
     frames: list[characters.Frame], times: dict[str, float]
-) -> Iterator[tuple[tuple[int, int], reference.Swing, np.ndarray, np.ndarray]]:
-    """For each frame and leg the memory after it, and the last and the next foothold."""
-    for leg in range(2):
-        before = None
-        for n, frame in enumerate(frames):
-            planted, up = bool(frame.stride.standing[leg] > 0.5), maths.Y
-            before, last, following = reference.follow(
-                times, RIG, frame, leg, planted, up, BALL_HEIGHT, before
+) -> Iterator[tuple[tuple[int, int], reference.Swing, float, np.ndarray, np.ndarray]]:
+    """For each frame and leg the memory after it, and the last and the next foothold.
+
+    With how regular all feet are.
+    """
+    before, steady = [], 0.0
+    for n, frame in enumerate(frames):
+        swings = [
+            reference.follow(
+                times,
+                RIG,
+                frame,
+                leg,
+                bool(frame.stride.standing[leg] > 0.5),
+                maths.Y,
+                BALL_HEIGHT,
+                before[leg] if before else None,
+                steady,
             )
-            yield (n, leg), before, last, following
+            for leg in range(2)
+        ]
+        before = [swing for swing, *_ in swings]
+        steady = reference.regular(before)
+        for leg, (swing, last, following) in enumerate(swings):
+            yield (n, leg), swing, steady, last, following
 
 
 def faster(frame: characters.Frame, factor: float, toes_up: float) -> characters.Frame:
@@ -159,28 +174,40 @@ def faster(frame: characters.Frame, factor: float, toes_up: float) -> characters
 
 
 @pytest.mark.parametrize(
-    ("factor", "toes_up"),
-    [(1.0, 0.0), (1.0, 0.3), (2.5, 0.0), (4.0, 0.0), (4.0, 0.15), (-0.25, 0.0), (-1.0, 0.0)],
-    ids=["walks", "walks flat", "nearly runs", "runs", "on the heels", "hardly back", "back"],
+    ("factor", "toes_up", "even"),
+    [
+        pytest.param(1.0, 0.0, False, id="walks"),
+        pytest.param(1.0, 0.0, True, id="walks evenly"),
+        pytest.param(1.0, 0.3, False, id="walks flat"),
+        pytest.param(2.5, 0.0, False, id="nearly runs"),
+        pytest.param(4.0, 0.0, False, id="runs"),
+        pytest.param(4.0, 0.15, False, id="on the heels"),
+        pytest.param(-0.25, 0.0, False, id="hardly back"),
+        pytest.param(-1.0, 0.0, False, id="back"),
+    ],
 )
-def test_memory_agrees_with_the_reference(factor, toes_up):
+def test_memory_agrees_with_the_reference(factor, toes_up, even):
     """Also where a foot hardly leaves its foothold, while contact flickers, and in turns."""
     walked = walk(RIG, COUNT, start=START, heading=0.3)[:: int(np.sign(factor))]
     frames = [faster(frame, factor, toes_up) for frame in walked]
-    frames = [turning(flickering(frame, n), n) for n, frame in enumerate(frames)]
+    if not even:
+        frames = [turning(flickering(frame, n), n) for n, frame in enumerate(frames)]
     times = {"probe.stance_time": 0.6, "probe.swing_time": 0.5 / abs(factor)}
     ik = parameter_tree.replace(AS_PREDICTED, times)
     memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
-    swings = memory.swings
-    for at_leg, swing, last, following in by_reference(frames, times):
+    swings, regular = memory.swings, []
+    for at_leg, swing, steady, last, following in by_reference(frames, times):
+        regular.append(steady)
         assert float(swings.fraction[at_leg]) == pytest.approx(swing.fraction, abs=1e-9)
         assert float(swings.time[at_leg]) == pytest.approx(swing.time, abs=1e-9)
         assert float(swings.further[at_leg]) == pytest.approx(swing.further, abs=1e-9)
         assert float(swings.swing_time[at_leg]) == pytest.approx(swing.usual, abs=1e-9)
         assert float(swings.lead[at_leg]) == pytest.approx(swing.lead, abs=1e-9)
+        assert float(swings.missed[at_leg]) == pytest.approx(swing.missed, abs=1e-9)
         first = swings.first_way_ws, swing.first_way
         for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
             np.testing.assert_allclose(got[at_leg][[0, 2]], wanted[[0, 2]], atol=1e-9)
+    assert (max(regular) > 0.9) == even
 
 
 @pytest.mark.slow
@@ -203,9 +230,10 @@ def test_how_sure_a_swing_is_of_its_foothold_agrees_with_the_reference():
     frames = walk(RIG, COUNT, start=START)
     sure = np.asarray(foreseen(PREDICTED, to_frames(frames))[1].sure)
     times = {"probe.stance_time": 0.65, "probe.swing_time": 0.55}
-    for at_leg, swing, last, following in by_reference(frames, times):
+    for at_leg, swing, steady, last, following in by_reference(frames, times):
         way = reference.across(following - last, maths.Y)
-        assert float(sure[at_leg]) == pytest.approx(reference.sureness(swing, way), abs=1e-6)
+        expected = reference.sureness(swing, way, steady)
+        assert float(sure[at_leg]) == pytest.approx(expected, abs=1e-6)
     assert ((sure > 0.05) & (sure < 0.95)).sum() > 5
 
 

@@ -17,7 +17,7 @@ from fitting.synthetic import actions, walker
 from stairs import grounds
 from stairs.__main__ import BOUNDS
 from stairs.flights import Flight, field_of, sample
-from stairs.walks import SETTLED, Verdict, placed, solve, stepping, walked
+from stairs.walks import SETTLED, STEPPED, Verdict, placed, solve, stepping, walked
 from support.experiments import ROOT
 
 
@@ -41,15 +41,21 @@ def test_they_do_so_on_rubble_curbs_ledges_and_ramps():
 
 
 @pytest.mark.slow
-def test_feet_stand_on_treads_that_nothing_foretells():
-    """From the first stride on; one walk of eight bends more, one of forty dips."""
+@pytest.mark.parametrize(
+    ("start", "least"),
+    [
+        pytest.param(SETTLED, Verdict(0.985, 0.985, 0.995, 0.95, 1.0), id="from the first stride"),
+        pytest.param(STEPPED, Verdict(0.995, 0.995, 1.0, 0.99, 1.0), id="after a step"),
+    ],
+)
+def test_feet_stand_on_treads_that_nothing_foretells(start, least):
+    """On as many of 500 flights; a foot whose first step was seen knows how it steps."""
     rng = np.random.default_rng(0)
     chosen = [sample(rng, field=True) for _ in range(500)]
-    pairs = walked(jaxik.presets.stride(foretold=False), chosen, known=False)
-    verdicts = np.array([verdict for _, verdict in pairs])
-    share = (verdicts <= np.array(BOUNDS)).mean(0)
-    assert (share >= Verdict(off=0.985, pop=0.96, dip=0.96, bend=0.85, sunk=1.0)).all()
-    assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.10]).all()
+    ik = jaxik.presets.stride(foretold=False)
+    verdicts = np.array([verdict for _, verdict in walked(ik, chosen, known=False, start=start)])
+    assert ((verdicts <= np.array(BOUNDS)).mean(0) >= least).all()
+    assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.08]).all()
 
 
 @pytest.mark.slow
@@ -66,7 +72,7 @@ def test_a_body_sinks_to_lower_stairs_no_faster_than_it_falls(known):
         rise = hip - animated - np.asarray(world.pos)[:, 1]
         bends = (rise[4:] - 2.0 * rise[2:-2] + rise[:-4]) * 30.0**2
         falls.append(-bends[SETTLED:-SETTLED].min() / 9.81)
-    assert 0.5 < max(falls) < 1.3
+    assert 0.5 < max(falls) < 1.4
 
 
 def off_ground(clip: Clip, ground: grounds.Ground) -> float:

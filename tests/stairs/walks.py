@@ -31,6 +31,7 @@ STEP_LENGTHS = (0.25, 0.35, 0.45, 0.55, 0.65)  # m
 STEP_SECONDS, STANCE = 0.55, 0.62  # s, and part of two steps
 HIGHEST = 0.32  # m, rise of one step of a walk: two stairs
 SETTLED = 20  # frames before and after which nothing is measured
+STEPPED = 90  # frames in which each foot makes a whole step
 
 
 class Walk(NamedTuple):
@@ -172,9 +173,9 @@ def rig_heights() -> tuple[float, float]:
     return footsteps.ANKLE_HEIGHT, footsteps.BALL_HEIGHT
 
 
-def judge(flight: Flight, level: jaxik.Frame, solved: Solved) -> Verdict:
-    """What is wrong with a walk over a flight; see `Verdict`."""
-    part = slice(SETTLED, FRAMES - SETTLED)
+def judge(flight: Flight, level: jaxik.Frame, solved: Solved, start: int = SETTLED) -> Verdict:
+    """What is wrong with a walk over a flight from a frame on; see `Verdict`."""
+    part = slice(start, FRAMES - SETTLED)
     standing = np.asarray(level.stride.standing) > 0
     above, sunk = flight.clearances(solved.soles)
     above, sunk = above.min(-1), sunk.max(-1)
@@ -190,17 +191,17 @@ def judge(flight: Flight, level: jaxik.Frame, solved: Solved) -> Verdict:
         heights = solved.ankle[:, leg, 1]
         runs = contacts.runs(standing[:, leg])
         for first, last in runs:
-            at = slice(max(first + 1, SETTLED), min(last + 1, FRAMES - SETTLED))
+            at = slice(max(first + 1, start), min(last + 1, FRAMES - SETTLED))
             pop = max(pop, change[at, leg].max(initial=0.0))
         for (_, last), (first, _) in zip(runs, runs[1:], strict=False):
             needed = np.linalg.norm(correction[first, leg] - correction[last, leg])
             smooth = 1.875 * needed / (first - last)
-            if last < SETTLED or first > FRAMES - SETTLED:
+            if last < start or first > FRAMES - SETTLED:
                 continue
             pop = max(pop, change[last + 1 : first + 1, leg].max(initial=0.0) - smooth)
             swing = heights[last : first + 1]
-            for start in (0, 1):
-                slow = heights[last - 2 + start : first + 3 : 2]
+            for odd in (0, 1):
+                slow = heights[last - 2 + odd : first + 3 : 2]
                 bend = max(bend, np.abs(np.diff(slow, 2)).max())
             before, after = np.maximum.accumulate(swing), np.maximum.accumulate(swing[::-1])[::-1]
             dip = max(dip, (np.minimum(before, after) - swing).max())
@@ -209,7 +210,7 @@ def judge(flight: Flight, level: jaxik.Frame, solved: Solved) -> Verdict:
 
 
 def walked(
-    ik: jaxik.FootIK, chosen: Sequence[Flight], *, known: bool = True
+    ik: jaxik.FootIK, chosen: Sequence[Flight], *, known: bool = True, start: int = SETTLED
 ) -> list[tuple[Flight, Verdict]]:
     """Flights with the verdict on a walk over each, with or without known footholds."""
     verdicts = []
@@ -218,5 +219,5 @@ def walked(
         if not known:
             stride = dataclasses.replace(frames.stride, known=0.0 * frames.stride.known)
             frames = dataclasses.replace(frames, stride=stride)
-        verdicts.append((flight, judge(flight, level, solve(ik, flight, frames))))
+        verdicts.append((flight, judge(flight, level, solve(ik, flight, frames), start)))
     return verdicts

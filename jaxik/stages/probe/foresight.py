@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.gate import AbstractGate
+from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import GRAVITY, Inputs, Moment
 from jaxik.world.frame import FORWARD, Contact, Frame, Stride, animated_ankles
@@ -35,7 +35,7 @@ STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
 EARLY, LATE = 0.3, 0.7  # of a swing, between which the foot's own motion takes over from the hip's
 UNSURE, SURE = 0.7, 0.88  # of a swing, between which a foot chooses where it will land
 EARLIER = 0.24  # of a swing, by how much earlier it chooses if the swing goes as foreseen
-AS_FORESEEN, OTHERWISE = 0.1, 0.25  # of its way, by which where it leads has changed since it began
+AS_FORESEEN, OTHERWISE = 0.08, 0.2  # of its way, by which where it leads has changed since it began
 BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch of the sole
 FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
@@ -105,16 +105,17 @@ class Swings:
     """s, how long each foot swings, as its last steps did."""
     lead: Float[Array, " legs"]
     """s, from when it lands until its hip is over its ball, as in its last steps."""
+    missed: Float[Array, " legs"]
+    """Of the way of its last step, how far from where it was expected each foot landed."""
 
 
 def no_swings(rig: Rig) -> Swings:
     """Memory before the first frame."""
     zero = jnp.zeros_like(rig.side)
     offset = jnp.zeros((*zero.shape, 3), zero.dtype)
-    still = offset[0]
-    return Swings(
-        zero, zero, zero, zero, zero, zero, offset, offset, offset, still, still, still, zero, zero
-    )
+    still, one = offset[0], jnp.ones_like(zero)
+    steps = zero, zero, zero, zero, zero, zero
+    return Swings(*steps, offset, offset, offset, still, still, still, zero, zero, one)
 
 
 @struct
@@ -170,18 +171,34 @@ def sureness(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, " legs"
     """0..1, how sure it is where swings lead: late in them, earlier if that has hardly changed.
 
     Of people on uneven ground, feet land 15 to 20 cm from where half of their swing leads; on a
-    walk that goes on as it is, 3 cm, and it has led there all the time.
+    walk that goes on as it is, 3 cm, and it has led there all the time. Where all feet have landed
+    as foreseen, a swing is sure from its start.
 
     Args:
         feet: what the frame shows.
         swings: how far the feet are.
         next_ws: where each will stand next, m, world space.
     """
-    way = _way(feet, swings, next_ws)
-    change = vec.safe_divide(vec.length(way - swings.first_way_ws), vec.length(way))
-    other = smoothing.smoothstep((change - AS_FORESEEN) / (OTHERWISE - AS_FORESEEN))
-    fraction = swings.fraction + EARLIER * swings.whole * (1.0 - other)
-    return smoothing.smoothstep((fraction - UNSURE) / (SURE - UNSURE))
+    goes_as_foreseen = _as_foreseen(_changed(_way(feet, swings, next_ws), swings))
+    fraction = swings.fraction + EARLIER * swings.whole * goes_as_foreseen
+    sure = smoothing.smoothstep((fraction - UNSURE) / (SURE - UNSURE))
+    return smoothing.lerp(sure, jnp.ones_like(sure), goes_as_foreseen * _regular(swings, feet.rig))
+
+
+def _regular(swings: Swings, rig: Rig) -> Float[Array, " legs"]:
+    """0..1, how far each foot's swing is one of a gait in which all feet land as foreseen."""
+    landed = jnp.where(rig.present, _as_foreseen(swings.missed), 1.0)
+    return swings.whole * HARD.minimum(landed, band=0.0)
+
+
+def _as_foreseen(changed: Array) -> Array:
+    """0..1, how far what has changed by a part of its way is as it was foreseen."""
+    return 1.0 - smoothing.smoothstep((changed - AS_FORESEEN) / (OTHERWISE - AS_FORESEEN))
+
+
+def _changed(way_ws: Array, swings: Swings) -> Float[Array, " legs"]:
+    """Of its way, by how much each differs from what was foreseen as the swing began."""
+    return vec.safe_divide(vec.length(way_ws - swings.first_way_ws), vec.length(way_ws))
 
 
 def _way(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, "legs 3"]:
@@ -307,13 +324,16 @@ def follow_swings(
     )
     landed = jnp.where(now.started, feet.planted * before.whole * (1.0 - same), 0.0)
     swing_time, lead = _learnt(now, feet, before, velocity, landed, stance_time, swing_time)
+    missed = jnp.where(now.started, before.missed, jnp.ones_like(time))
+    missed = smoothing.lerp(missed, _changed(travelled, before), landed)
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
     walks = _walks(feet, velocity)
     by_time = before.fraction + dt * pace
     pitched = walks * smoothing.clip_to_one(-lowest / PITCHED)
-    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, pitched, dt)
+    pitch_counts = pitched * (1.0 - LEARNT * _regular(before, feet.rig))
+    fraction = _turned(before.fraction, by_time, feet.pitch, lowest, pitch_counts, dt)
     duration = _duration(time, fraction, swing_time)
     by_motion = _fraction_of_motion(time, travelled, moved, dt)
     fraction = _sunk(feet, before, fraction, duration, by_motion, pitched, dt)
@@ -340,6 +360,7 @@ def follow_swings(
         turning,
         swing_time,
         lead,
+        missed,
     )
     foot_velocity = vec.scale(moved, vec.safe_divide(jnp.ones_like(dt), dt))
     next_ws = _landing(feet, swings, foot_velocity)

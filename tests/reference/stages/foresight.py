@@ -37,11 +37,22 @@ class Swing:
     """Of its swings."""
     lead: float
     """From landing until the hip is over the ball."""
+    missed: float = 1.0
+    """By what part of its way its last step landed elsewhere than foreseen as it began."""
 
 
 def duration(time: float, fraction: float, usual: float) -> float:
     so_far = clip(time / max(fraction, TOES_DOWN), 0.5 * usual, 2.0 * usual)
     return lerp(usual, so_far, smooth01((fraction - TOES_DOWN) / 0.1))
+
+
+def as_foreseen(changed: float) -> float:
+    return 1.0 - smooth01((changed - 0.08) / 0.12)
+
+
+def regular(swings: list[Swing]) -> float:
+    """How far all feet last landed as foreseen."""
+    return min(as_foreseen(swing.missed) for swing in swings)
 
 
 def follow(
@@ -53,10 +64,12 @@ def follow(
     up: Array,
     ball_height: float,
     before: Swing | None,
+    steady: float,
 ) -> tuple[Swing, Array, Array]:
     """Memory after the frame, and where the foot last stood and will stand.
 
-    `ball_height` is that of the ball of a foot that stands flat.
+    `ball_height` is that of the ball of a foot that stands flat, `steady` how `regular` the feet
+    were in the frame before.
     """
     stance, usual = parameters["probe.stance_time"], parameters["probe.swing_time"]
     bounds = 0.5 * usual, 2.0 * usual
@@ -80,10 +93,10 @@ def follow(
         since_last = 0.5 * stance + ahead + fraction * usual
         time, lowest, moved = dt + fraction * usual, pitch, across(velocity * dt, up)
         travelled, smooth = since_last * flat, velocity
-        further, whole = 0.0, False
+        further, whole, missed = 0.0, False, 1.0
         turning, lead = np.zeros(3), 0.5 * stance
     else:
-        usual, lead = before.usual, before.lead
+        usual, lead, missed = before.usual, before.lead, before.missed
         moved = across(from_root - before.ball_from_root + velocity * dt, up)
         travelled = before.travelled + moved
         smoothing = maths.fraction_of_half_life(0.1, dt)
@@ -97,7 +110,8 @@ def follow(
         back = smooth01(-float(flat @ ahead) / math.sqrt(GRAVITY * leg_length) / 0.1)
         walks = (1.0 - runs) * (1.0 - back)
         pitched = clip(-lowest / 0.5, 0.0, 1.0) * walks
-        fraction = turned(before, dt, pitch, lowest, usual, pitched)
+        by_time = 0.7 * steady if before.whole else 0.0
+        fraction = turned(before, dt, pitch, lowest, usual, pitched * (1.0 - by_time))
         at_speed = by_motion(time, travelled, moved, dt)
         over_floor = float(from_root @ up) - ball_height
         lowest_point = max(min(over_floor, over_floor - math.sin(pitch) * rig.foot), 0.0)
@@ -117,6 +131,9 @@ def follow(
             travelled = np.zeros(3)
         elif not before.planted:  # only a foot that comes from elsewhere has a new foothold
             away = smooth01((length(travelled) - 0.04) / 0.04)
+            miss = length(travelled - before.first_way)
+            if away > 0.0 and before.whole:
+                missed = lerp(missed, miss / length(travelled), away)
             travelled = travelled * (1.0 - away)
             if before.whole:  # 70 % of a step count for the next
                 flat = across(smooth, up)
@@ -140,6 +157,7 @@ def follow(
         turning,
         usual,
         lead,
+        missed,
     )
     fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
@@ -163,13 +181,12 @@ def follow(
     return swing, last, following
 
 
-def sureness(swing: Swing, way: Array) -> float:
-    """How sure a swing is to lead there, level from its last foothold."""
-    if length(way) == 0.0:
-        return 0.0
-    changed = smooth01((length(way - swing.first_way) / length(way) - 0.1) / 0.15)
-    earlier = 0.24 * (1.0 - changed) if swing.whole else 0.0
-    return smooth01((swing.fraction + earlier - 0.7) / 0.18)
+def sureness(swing: Swing, way: Array, steady: float) -> float:
+    """How sure a swing is to lead there, level from its last foothold, with so `regular` feet."""
+    as_before = as_foreseen(length(way - swing.first_way) / length(way)) if way @ way else 1.0
+    as_before *= swing.whole
+    sure = smooth01((swing.fraction + 0.24 * as_before - 0.7) / 0.18)
+    return 1.0 - (1.0 - sure) * (1.0 - as_before * steady)
 
 
 def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
