@@ -35,7 +35,8 @@ STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
 EARLY, LATE = 0.3, 0.7  # of a swing, between which the foot's own motion takes over from the hip's
 UNSURE, SURE = 0.7, 0.88  # of a swing, between which a foot chooses where it will land
 EARLIER = 0.24  # of a swing, by how much earlier it chooses if the swing goes as foreseen
-AS_FORESEEN, OTHERWISE = 0.08, 0.2  # of its way, by which where it leads has changed since it began
+# Of its way: where it leads has changed by less since it began, or by more.
+AS_FORESEEN, OTHERWISE = 0.08, 0.2
 BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch of the sole
 FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
@@ -293,7 +294,8 @@ def follow_swings(
     how far it still goes, its pace counts as well as its pitch.
 
     How long a foot swings, and how early it lands before its hip is over it, are the usual times at
-    first, then more and more those of its own steps.
+    first, then more and more those of its own steps. Where all feet landed as foreseen in their
+    last steps, a swing goes by that time, as far as it is learnt, rather than by its pitch.
 
     Args:
         now: the frame.
