@@ -107,7 +107,7 @@ class Swings:
     lead: Float[Array, " legs"]
     """s, from when it lands until its hip is over its ball, as in its last steps."""
     missed: Float[Array, " legs"]
-    """Of the way of its last step, how far from where it was expected each foot landed."""
+    """0..1 of the way of its last step, how far from where it was expected each foot landed."""
 
 
 def no_swings(rig: Rig) -> Swings:
@@ -327,7 +327,7 @@ def follow_swings(
     landed = jnp.where(now.started, feet.planted * before.whole * (1.0 - same), 0.0)
     swing_time, lead = _learnt(now, feet, before, velocity, landed, stance_time, swing_time)
     missed = jnp.where(now.started, before.missed, jnp.ones_like(time))
-    missed = smoothing.lerp(missed, _changed(travelled, before), landed)
+    missed = smoothing.lerp(missed, smoothing.clip_to_one(_changed(travelled, before)), landed)
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)

@@ -133,7 +133,7 @@ def follow(
             away = smooth01((length(travelled) - 0.04) / 0.04)
             miss = length(travelled - before.first_way)
             if away > 0.0 and before.whole:
-                missed = lerp(missed, miss / length(travelled), away)
+                missed = lerp(missed, min(miss / length(travelled), 1.0), away)
             travelled = travelled * (1.0 - away)
             if before.whole:  # 70 % of a step count for the next
                 flat = across(smooth, up)
