@@ -139,11 +139,8 @@ def turning(frame: characters.Frame, n: int) -> characters.Frame:
 def by_reference(
     frames: list[characters.Frame], times: dict[str, float]
 ) -> Iterator[tuple[tuple[int, int], reference.Swing, float, np.ndarray, np.ndarray]]:
-    """For each frame and leg the memory after it, and the last and the next foothold.
-
-    With how regular all feet are.
-    """
-    before, steady = [], 0.0
+    """For each frame and leg the memory after it, `regularity`, and last and next foothold."""
+    before, regular = [], 0.0
     for n, frame in enumerate(frames):
         swings = [
             reference.follow(
@@ -155,14 +152,14 @@ def by_reference(
                 maths.Y,
                 BALL_HEIGHT,
                 before[leg] if before else None,
-                steady,
+                regular,
             )
             for leg in range(2)
         ]
         before = [swing for swing, *_ in swings]
-        steady = reference.regular(before)
+        regular = reference.regularity(before)
         for leg, (swing, last, following) in enumerate(swings):
-            yield (n, leg), swing, steady, last, following
+            yield (n, leg), swing, regular, last, following
 
 
 def faster(frame: characters.Frame, factor: float, toes_up: float) -> characters.Frame:
@@ -195,9 +192,9 @@ def test_memory_agrees_with_the_reference(factor, toes_up, even):
     times = {"probe.stance_time": 0.6, "probe.swing_time": 0.5 / abs(factor)}
     ik = parameter_tree.replace(AS_PREDICTED, times)
     memory, stride = jax.tree.map(np.asarray, foreseen(ik, to_frames(frames)))
-    swings, regular = memory.swings, []
-    for at_leg, swing, steady, last, following in by_reference(frames, times):
-        regular.append(steady)
+    swings, regularities = memory.swings, []
+    for at_leg, swing, regular, last, following in by_reference(frames, times):
+        regularities.append(regular)
         assert float(swings.fraction[at_leg]) == pytest.approx(swing.fraction, abs=1e-9)
         assert float(swings.time[at_leg]) == pytest.approx(swing.time, abs=1e-9)
         assert float(swings.further[at_leg]) == pytest.approx(swing.further, abs=1e-9)
@@ -207,7 +204,7 @@ def test_memory_agrees_with_the_reference(factor, toes_up, even):
         first = swings.first_way_ws, swing.first_way
         for got, wanted in (first, (stride.last_ws, last), (stride.next_ws, following)):
             np.testing.assert_allclose(got[at_leg][[0, 2]], wanted[[0, 2]], atol=1e-9)
-    assert (max(regular) > 0.9) == even
+    assert (max(regularities) > 0.9) == even
 
 
 @pytest.mark.slow
@@ -230,9 +227,9 @@ def test_how_sure_a_swing_is_of_its_foothold_agrees_with_the_reference():
     frames = walk(RIG, COUNT, start=START)
     sure = np.asarray(foreseen(PREDICTED, to_frames(frames))[1].sure)
     times = {"probe.stance_time": 0.65, "probe.swing_time": 0.55}
-    for at_leg, swing, steady, last, following in by_reference(frames, times):
+    for at_leg, swing, regular, last, following in by_reference(frames, times):
         way = reference.across(following - last, maths.Y)
-        expected = reference.sureness(swing, way, steady)
+        expected = reference.sureness(swing, way, regular)
         assert float(sure[at_leg]) == pytest.approx(expected, abs=1e-6)
     assert ((sure > 0.05) & (sure < 0.95)).sum() > 5
 

@@ -212,7 +212,7 @@ def judge(flight: Flight, level: jaxik.Frame, solved: Solved, start: int = SETTL
 def walked(
     ik: jaxik.FootIK, chosen: Sequence[Flight], *, known: bool = True, start: int = SETTLED
 ) -> list[tuple[Flight, Verdict]]:
-    """Flights with the verdict on a walk over each, with or without known footholds."""
+    """Flights with the verdict on a walk over each from a frame on, footholds known or not."""
     verdicts = []
     for flight in chosen:
         frames, level = placed(flight)

@@ -115,8 +115,8 @@ def no_swings(rig: Rig) -> Swings:
     zero = jnp.zeros_like(rig.side)
     offset = jnp.zeros((*zero.shape, 3), zero.dtype)
     still, one = offset[0], jnp.ones_like(zero)
-    steps = zero, zero, zero, zero, zero, zero
-    return Swings(*steps, offset, offset, offset, still, still, still, zero, zero, one)
+    numbers = zero, zero, zero, zero, zero, zero
+    return Swings(*numbers, offset, offset, offset, still, still, still, zero, zero, one)
 
 
 @struct
@@ -183,10 +183,11 @@ def sureness(feet: Feet, swings: Swings, next_ws: Array) -> Float[Array, " legs"
     goes_as_foreseen = _as_foreseen(_changed(_way(feet, swings, next_ws), swings))
     fraction = swings.fraction + EARLIER * swings.whole * goes_as_foreseen
     sure = smoothing.smoothstep((fraction - UNSURE) / (SURE - UNSURE))
-    return smoothing.lerp(sure, jnp.ones_like(sure), goes_as_foreseen * _regular(swings, feet.rig))
+    from_start = goes_as_foreseen * _regularity(swings, feet.rig)
+    return smoothing.lerp(sure, jnp.ones_like(sure), from_start)
 
 
-def _regular(swings: Swings, rig: Rig) -> Float[Array, " legs"]:
+def _regularity(swings: Swings, rig: Rig) -> Float[Array, " legs"]:
     """0..1, how far each foot's swing is one of a gait in which all feet land as foreseen."""
     landed = jnp.where(rig.present, _as_foreseen(swings.missed), 1.0)
     return swings.whole * HARD.minimum(landed, band=0.0)
@@ -334,7 +335,7 @@ def follow_swings(
     walks = _walks(feet, velocity)
     by_time = before.fraction + dt * pace
     pitched = walks * smoothing.clip_to_one(-lowest / PITCHED)
-    pitch_counts = pitched * (1.0 - LEARNT * _regular(before, feet.rig))
+    pitch_counts = pitched * (1.0 - LEARNT * _regularity(before, feet.rig))
     fraction = _turned(before.fraction, by_time, feet.pitch, lowest, pitch_counts, dt)
     duration = _duration(time, fraction, swing_time)
     by_motion = _fraction_of_motion(time, travelled, moved, dt)

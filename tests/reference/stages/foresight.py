@@ -50,7 +50,7 @@ def as_foreseen(changed: float) -> float:
     return 1.0 - smooth01((changed - 0.08) / 0.12)
 
 
-def regular(swings: list[Swing]) -> float:
+def regularity(swings: list[Swing]) -> float:
     """How far all feet last landed as foreseen."""
     return min(as_foreseen(swing.missed) for swing in swings)
 
@@ -64,12 +64,12 @@ def follow(
     up: Array,
     ball_height: float,
     before: Swing | None,
-    steady: float,
+    regular: float,
 ) -> tuple[Swing, Array, Array]:
     """Memory after the frame, and where the foot last stood and will stand.
 
-    `ball_height` is that of the ball of a foot that stands flat, `steady` how `regular` the feet
-    were in the frame before.
+    `ball_height` is that of the ball of a foot that stands flat, `regular` the feet's `regularity`
+    in the frame before.
     """
     stance, usual = parameters["probe.stance_time"], parameters["probe.swing_time"]
     bounds = 0.5 * usual, 2.0 * usual
@@ -110,7 +110,7 @@ def follow(
         back = smooth01(-float(flat @ ahead) / math.sqrt(GRAVITY * leg_length) / 0.1)
         walks = (1.0 - runs) * (1.0 - back)
         pitched = clip(-lowest / 0.5, 0.0, 1.0) * walks
-        by_time = 0.7 * steady if before.whole else 0.0
+        by_time = 0.7 * regular if before.whole else 0.0
         fraction = turned(before, dt, pitch, lowest, usual, pitched * (1.0 - by_time))
         at_speed = by_motion(time, travelled, moved, dt)
         over_floor = float(from_root @ up) - ball_height
@@ -181,12 +181,12 @@ def follow(
     return swing, last, following
 
 
-def sureness(swing: Swing, way: Array, steady: float) -> float:
-    """How sure a swing is to lead there, level from its last foothold, with so `regular` feet."""
+def sureness(swing: Swing, way: Array, regular: float) -> float:
+    """How sure a swing is to lead there, level from its last foothold, at this `regularity`."""
     as_before = as_foreseen(length(way - swing.first_way) / length(way)) if way @ way else 1.0
     as_before *= swing.whole
     sure = smooth01((swing.fraction + 0.24 * as_before - 0.7) / 0.18)
-    return 1.0 - (1.0 - sure) * (1.0 - as_before * steady)
+    return 1.0 - (1.0 - sure) * (1.0 - as_before * regular)
 
 
 def by_motion(time: float, travelled: Array, moved: Array, dt: float) -> float:
