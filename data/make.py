@@ -37,6 +37,7 @@ from fitting.runtime.precision import in_float64
 from fitting.synthetic import multi_limb, terrain_meshes, walker
 from fitting.synthetic.walker import Slide, Slip, Stop
 from jaxik.maths import parameter_tree
+from jaxik.record.parameters import half_life_of_gain
 from jaxik.world.terrain import Terrain
 
 HERE = Path(__file__).resolve().parent
@@ -105,6 +106,7 @@ class SyntheticReference:
     faithful: bool = False  # whether the preset is the original
 
 
+TICK_HZ = 30.0  # of the game whose record has these gains
 RECORD_TRUTH = {
     "contact.planted_height": 0.125,
     "contact.raised_height": 0.20,
@@ -114,10 +116,10 @@ RECORD_TRUTH = {
     "lean.side_rate": 0.25,
     "lean.forward_rate_slide": 0.55,
     "lean.side_rate_slide": 0.85,
-    "lean.gain": 0.12,
-    "lean.gain_slide": 0.15,
-    "lean.slide_on_gain": 0.08,
-    "lean.slide_off_gain": 0.07,
+    "lean.half_life": half_life_of_gain(0.12, TICK_HZ),
+    "lean.half_life_slide": half_life_of_gain(0.15, TICK_HZ),
+    "lean.slide_on_half_life": half_life_of_gain(0.08, TICK_HZ),
+    "lean.slide_off_half_life": half_life_of_gain(0.07, TICK_HZ),
     "lock.release_cone": 0.10,
     "lock.release_distance": 0.08,
     "lock.relock_threshold": 0.35,
@@ -125,7 +127,7 @@ RECORD_TRUTH = {
     "lock.lock_half_life": 0.025,
     "lock.unlock_half_life": 0.06,
     "pelvis.limit": 0.22,
-    "pelvis.on_gain": 0.15,
+    "pelvis.half_life": half_life_of_gain(0.15, TICK_HZ),
     "leg.max_knee_angle": 2.85,
     "leg.soften": 0.98,
     "foot.max_pitch": 0.26,

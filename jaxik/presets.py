@@ -126,7 +126,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         lean=NoLean(),
         lock=NoLock(),
         separation=NoSeparation(),
-        pelvis=LowestPelvis(limit=math.inf, on_gain=1.0, off_gain=1.0),
+        pelvis=LowestPelvis(limit=math.inf, half_life=0.0, airborne_half_life=0.0),
         effector=DirectEffector(if_found=True),
         leg=PoleLeg(),
         foot=AimFoot(),

@@ -330,7 +330,7 @@ def test_a_fit_can_be_used_and_systems_be_run_on_its_clips_where_jax_has_32_bits
             problem.log_probability(solution.u),
             problem.space.values(solution.u),
             problem.space.pack(ik),
-            parameter_tree.get(ik, "pelvis.on_gain"),
+            parameter_tree.get(ik, "pelvis.half_life"),
             done.fitted.results[0].body.pos,
             assess_identifiability(problem, solution.weighted(float(problem.weight))).contraction,
         ]

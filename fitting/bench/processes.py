@@ -32,7 +32,7 @@ reference = "reference.npz"
 base = "base.npz"
 terrain = "ground.ply"
 [free]
-pelvis.on_gain = {}
+pelvis.half_life = {}
 foot.max_pitch = { low = 0.1 }
 [fit]
 starts = 1
@@ -97,7 +97,7 @@ def of_devices(count: int) -> dict[str, float]:
     """Many systems on a clip, on so many devices."""
     problem = workloads.problem(FRAMES)
     ik = problem.space.unpack(problem.space.start)
-    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.05, 0.9, SYSTEMS)})
+    batch = fitting.vary(ik, {"pelvis.half_life": np.linspace(0.05, 0.9, SYSTEMS)})
     devices = jax.local_devices()[:count]
     return _second_time(lambda: fitting.evaluate_many(batch, problem.data, devices=devices))
 
@@ -108,7 +108,7 @@ def of_clips(count: int) -> dict[str, float]:
     ik = problem.space.unpack(problem.space.start)
     lengths = np.linspace(*LENGTHS, count).astype(int)
     clips = [workloads.first_frames(problem.data[0], length) for length in lengths]
-    single = fitting.vary(ik, {"pelvis.on_gain": [0.2]})
+    single = fitting.vary(ik, {"pelvis.half_life": [0.2]})
     return _second_time(lambda: fitting.evaluate_many(single, clips))
 
 

@@ -43,10 +43,10 @@ TRUTH = {
     "target.rise_half_life": 0.04, "target.fall_half_life": 0.07,
     "lean.forward_rate": -0.55, "lean.side_rate": 0.25,
     "lean.forward_rate_slide": 0.55, "lean.side_rate_slide": 0.85,
-    "lean.gain": 0.12, "lean.gain_slide": 0.15,
-    "lean.slide_on_gain": 0.08, "lean.slide_off_gain": 0.07,
+    "lean.half_life": 0.1807, "lean.half_life_slide": 0.1422,
+    "lean.slide_on_half_life": 0.2771, "lean.slide_off_half_life": 0.3184,
     "lock.lock_half_life": 0.025, "lock.unlock_half_life": 0.06,
-    "pelvis.limit": 0.22, "pelvis.on_gain": 0.15,
+    "pelvis.limit": 0.22, "pelvis.half_life": 0.1422,
     "leg.max_knee_angle": 2.85, "leg.soften": 0.96,
     "foot.max_pitch": 0.26, "foot.min_pitch": -0.3,
     "foot.max_roll": 0.12, "foot.min_roll": -0.2,
@@ -58,7 +58,7 @@ GROUNDS = (
 )  # fmt: skip
 # Parameters that differ within a crowd, and the ranges from which they are drawn.
 DRAWN = {
-    "pelvis.on_gain": (0.05, 0.5),
+    "pelvis.half_life": (0.033, 0.45),
     "pelvis.limit": (0.1, 0.35),
     "lean.forward_rate": (-0.8, 0.4),
     "target.rise_half_life": (0.005, 0.12),

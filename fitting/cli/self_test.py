@@ -17,7 +17,7 @@ from fitting.studies import exports
 from .examination import Finding
 
 EXAMPLE = "uneven_walk"
-FREE = "pelvis.on_gain"
+FREE = "pelvis.half_life"
 STEPS = 6  # of Levenberg-Marquardt; four are enough
 COST = 4348.38  # of the true values: 8640 residuals, whose mean square is that of noise, 1.007
 TOLERANCE = 0.01  # of the cost; a step of another size in one foot changes it by more

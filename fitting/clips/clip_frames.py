@@ -220,7 +220,14 @@ def clip_from_result(
         floor: as passed to `frames_from_clip`.
         up_ws: as passed to `frames_from_clip`.
         rise: as passed to `frames_from_clip`.
+
+    Raises:
+        ValueError: the poses are not finite.
     """
+    for transform in (result.body, *vars(result.pose).values()):
+        size = np.linalg.norm(transform.rot, axis=-1)  # 0 after a turn by an infinite angle
+        if not (np.isfinite(transform.pos).all() and np.isfinite(size).all() and size.all()):
+            raise ValueError("these parameters give poses that are not finite")
     world = clip.world_from_model(floor, up_ws)
     if rise is not None:
         world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)

@@ -29,7 +29,7 @@ from .experiment import (
     FitOptions,
 )
 from .record_files import restrict
-from .systems import DEFAULT_PRESET, preset_system, read_free_table, with_rules
+from .systems import DEFAULT_PRESET, preset_system, read_free_table, read_parameters, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
 # The first keys of a clip, in the order that digests of unfinished campaigns know.
@@ -66,7 +66,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     sigmas = check_table(flatten(top.get("sigmas", {}), 2), ALL_SIGMA_KEYS, f"{path} [sigmas]")
     if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in SIGMAS):
         raise ValueError(f"{path} [sigmas]: all of {list(SIGMAS)} are inf; wanted one that is not")
-    free = read_free_table(top["free"], f"{path} [free]")
+    free = read_free_table(top["free"], ik, f"{path} [free]")
     without = file_tables.read_ablations(top.get("without", ()), ik, f"{path} [[without]]")
     places = Places(path, top.pop("written_in", None))  # another is named when it is written again
     clips = tuple(_with_files(entry, places) for entry in top["clips"])
@@ -82,7 +82,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "capture": capture,
         "prior": file_tables.read_priors(top.get("prior", {}), known, f"{path} [prior]"),
         "start": file_tables.read_start(top.get("start", {}), known, f"{path} [start]"),
-        "parameters": flatten(top.get("parameters", {}), 2),
+        "parameters": read_parameters(top.get("parameters", {}), ik),
         "sigmas": sigmas,
         "without": without,
     }

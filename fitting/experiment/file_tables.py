@@ -19,7 +19,14 @@ from fitting.runtime.declarations import NEEDED, NUMBER, Key, check_table, key, 
 from fitting.runtime.validation import Content, Table, check_keys, flatten, nest
 from jaxik.maths import parameter_tree
 
-from .systems import FREE_KEYS, leaf_names, read_free_table, with_parameters, with_rules
+from .systems import (
+    FREE_KEYS,
+    leaf_names,
+    read_free_table,
+    read_parameters,
+    with_parameters,
+    with_rules,
+)
 
 COMPLETE = "all rules"  # the name of the experiment with nothing left out
 
@@ -63,9 +70,9 @@ def _read(table: Ablation, ik: jaxik.FootIK, where: str) -> Ablation:
     if not table.name.strip():
         raise ValueError(f"{where}: a variant without a name; wanted name = 'what is left out'")
     where = f"{where} {table.name}"
-    parameters = validation.flatten(table.parameters, 2)
-    free = read_free_table(table.free, f"{where}: free")
     other = with_rules(ik, table.rules, f"{where}: rules")
+    parameters = read_parameters(table.parameters, other)
+    free = read_free_table(table.free, other, f"{where}: free")
     with_parameters(other, parameters, f"{where}: parameters")
     leaves = {full.partition("[")[0]: None for full in free}  # one leg's element has an index
     validation.check_keys(leaves, leaf_names(other), f"{where}: free")

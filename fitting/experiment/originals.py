@@ -124,7 +124,7 @@ def _off(ik: jaxik.FootIK) -> tuple[str, ...]:
 
 def _off_in_ozz(ik: jaxik.FootIK) -> tuple[str, ...]:
     others = ("probe.use_toe", "probe.toe_ls", "pelvis.vertical_only", "pelvis.wait_to_rise")
-    return (*_off(ik), *others, "pelvis.tick_hz", "pelvis.off_gain", "leg.hint_offset")
+    return (*_off(ik), *others, "pelvis.airborne_half_life", "leg.hint_offset")
 
 
 def _off_in_mec(ik: jaxik.FootIK) -> tuple[str, ...]:

@@ -116,7 +116,7 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
         ik = preset.system(own)
     ik = systems.with_rules(ik, top.rules, f"{path} [rules]", own)
     validation.check_keys(content, list(vars(ik)), str(path))
-    ik = systems.with_parameters(ik, validation.flatten(content, 2), str(path))
+    ik = systems.with_parameters(ik, systems.read_parameters(content, ik), str(path))
     if top.leg_length is not None and rig is not None:
         ik = body.similar(ik, body.leg_length(rig) / top.leg_length)
     return ik, preset

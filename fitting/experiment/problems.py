@@ -29,14 +29,14 @@ from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
 from fitting.problem.shared_world import share_world
 from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64, with_floats
-from fitting.runtime.validation import error_context, flatten, read_toml
+from fitting.runtime.validation import error_context, read_toml
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
 from . import file_tables, track_files
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
-from .systems import with_parameters, without_own_root
+from .systems import read_parameters, with_parameters, without_own_root
 
 SHORTEST_WITH_HOLDOUT = 3.0  # s: of a shorter clip, hardly a stride would be left to fit
 
@@ -331,7 +331,8 @@ def load_known_values(
         return None
     ik = experiment.preset_system() if ik is None else ik
     content = read_toml(path, "a truth")
-    leaves = flatten({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
+    stages = {stage: table for stage, table in content.items() if stage in vars(ik)}
+    leaves = read_parameters(stages, ik)
     with_parameters(ik, leaves, str(path))
     known: dict[str, float] = {}
     for name, value in leaves.items():

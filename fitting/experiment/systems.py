@@ -3,11 +3,10 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from inspect import signature
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike
 
 import jaxik
 from fitting.clips.clip import Clip
@@ -15,11 +14,13 @@ from fitting.inference.sensitivity import FreeTable
 from fitting.problem.space import Override
 from fitting.runtime import activity
 from fitting.runtime.declarations import check_table, keys
-from fitting.runtime.validation import Table, check_keys, flatten
+from fitting.runtime.validation import Content, Table, check_keys, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world import body
 from jaxik.world.arguments import LAYERS
+
+from .former import FORMER_RULES, FormerRule, free_with_half_lives, parameters_with_half_lives
 
 
 def _concrete_rules(rule: type[eqx.Module]) -> list[type[eqx.Module]]:
@@ -33,33 +34,6 @@ STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules to choose from, 
     for stage in fields(jaxik.FootIK)
 }
 
-
-class FormerRule(NamedTuple):
-    """What the name of a rule meant before rules were merged."""
-
-    name: str
-    """Of the rule as which it lives on."""
-    values: Mapping[str, float]
-    """What that rule has other than its defaults."""
-    is_meant: Callable[[Any], ArrayLike]
-    """Whether a rule of that name already is the former one, whatever its other values."""
-
-
-FORMER_RULES = {
-    "IdleContact": FormerRule(
-        "StandingContact", {"idle_speed": 0.0}, lambda rule: np.isfinite(rule.idle_speed)
-    ),
-    "StandingContact": FormerRule("StandingContact", {}, lambda rule: np.isinf(rule.idle_speed)),
-    "NoWarp": FormerRule("StrideWarp", {"max_scale": 1.0, "min_scale": 1.0}, lambda rule: False),
-    "ContactTarget": FormerRule(
-        "SoleTarget", {"max_slope": 0.0, "foot_height": 0.1}, lambda rule: rule.max_slope == 0
-    ),
-    "SoleTarget": FormerRule("SoleTarget", {}, lambda rule: rule.max_slope > 0),
-    "FoundEffector": FormerRule("DirectEffector", {"if_found": True}, lambda rule: rule.if_found),
-    "DirectEffector": FormerRule("DirectEffector", {}, lambda rule: ~rule.if_found),
-    "HintLeg": FormerRule("PoleLeg", {"to_hint": True}, lambda rule: rule.to_hint),
-    "PoleLeg": FormerRule("PoleLeg", {}, lambda rule: ~rule.to_hint),
-}
 
 OWN_ROOT = "root.enabled"  # set by an experiment only to overrule where clips put the root
 
@@ -291,9 +265,14 @@ def leaf_names(ik: jaxik.FootIK) -> list[str]:
     return [slot.name for slot in parameter_tree.slots(ik)]
 
 
-def read_free_table(table: Table, where: str) -> FreeTable:
+def read_parameters(table: Table, ik: jaxik.FootIK) -> Content:
+    """The values in a table of a system's parameters by dotted name; nothing is checked."""
+    return parameters_with_half_lives(flatten(table, 2), leaf_names(ik))
+
+
+def read_free_table(table: Table, ik: jaxik.FootIK, where: str) -> FreeTable:
     """The entries of a [free] table by dotted name; ValueError for a wrong key or value."""
-    named = flatten(table, 2)
+    named = free_with_half_lives(flatten(table, 2), leaf_names(ik))
     for name, entry in named.items():
         if isinstance(entry, Mapping) and (old := [key for key in MOVED_KEYS if key in entry]):
             moved = ", ".join(f"{MOVED_KEYS[key]} = {entry[key]}" for key in old)

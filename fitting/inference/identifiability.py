@@ -53,11 +53,7 @@ class Ridge:
         words, first = "", 1.0
         for name, coefficient in zip(self.names, self.coefficients, strict=True):
             scale = parameters[name].scale
-            term = f"half-life of `{name}`" if scale == "gain" else f"`{name}`"
-            if not is_product and scale != "linear":
-                term = f"ln({term})"
-            if scale == "gain":  # on whose scale a longer half-life is a smaller coordinate
-                coefficient = -coefficient
+            term = f"`{name}`" if is_product or scale == "linear" else f"ln(`{name}`)"
             size = abs(coefficient)
             if not np.isclose(size, 1, atol=0.05):
                 term = f"{term}^{size:.2g}" if is_product else f"{size:.2g} {term}"

@@ -40,7 +40,7 @@ AT_LIMITS = {
     "probe.max_slope": "slopes[ steeper than {}]",
 }
 EVENTS = {  # motion without which a parameter has no effect
-    "pelvis.off_gain": "a run: moments without a foot on the ground",
+    "pelvis.airborne_half_life": "a run: moments without a foot on the ground",
     "lock.lock_half_life": "steps: feet that still move when they lock",
     "lock.unlock_half_life": "steps: locked feet that are released away from their animation",
     "target.rise_half_life": "steps or slopes up: ground that becomes higher",

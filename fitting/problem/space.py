@@ -4,10 +4,9 @@ Per parameter, whose range, kind and scale its declaration says,
 
     value = g⁻¹( g(floor) + (g(high) - g(floor)) sigmoid(u) )
 
-with `g` the identity, the logarithm, or for a gain `log(-log(1 - gain))`, which is minus the
-logarithm of its half-life up to a constant, so that the tick rate cancels. `floor` is the lower
-bound, or, for a parameter declared above another one, the larger of that bound and the other one's
-value: the order holds for every `u`. `start` is where a search begins.
+with `g` the identity or the logarithm. `floor` is the lower bound, or, for a parameter declared
+above another one, the larger of that bound and the other one's value: the order holds for every
+`u`. `start` is where a search begins.
 
 `prior` is the knowledge before any data, of each parameter independently, in one of two shapes:
 
@@ -42,14 +41,13 @@ from scipy import special
 
 from fitting.runtime.declarations import Table, check_table, key, keys
 from fitting.runtime.precision import in_float64
-from jaxik.maths import parameter_tree, smoothing
+from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
 from jaxik.world.skeleton import Rig
 
-DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (1e-9, 1.0 - 1e-9)}
+DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf)}
 NARROWEST, WIDEST = 1e-6, 1e6  # of a range, times the one that the rule declares
 LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
-TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 
 Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
 Shape = Literal["normal", "uniform"]
@@ -80,9 +78,7 @@ class Override:
     kind: parameter_tree.ParameterKind | None = key(
         None, "A threshold moves a hard decision, so that its derivative is 0."
     )
-    scale: parameter_tree.Scale | None = key(
-        None, "How the fit steps: evenly, by factors, or as the half-life of a gain."
-    )
+    scale: parameter_tree.Scale | None = key(None, "How the fit steps: evenly, or by factors.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,24 +203,12 @@ def library_of(*arrays: object) -> ModuleType:
 
 def to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
     """The coordinate in which a range is divided evenly: `g` of `space`'s docstring."""
-    match scale:
-        case "log":
-            return library.log(value)
-        case "gain":
-            return library.log(-library.log1p(-value))
-        case _:
-            return value
+    return library.log(value) if scale == "log" else value
 
 
 def from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
     """Inverse of `to_scale`."""
-    match scale:
-        case "log":
-            return library.exp(coordinate)
-        case "gain":
-            return -library.expm1(-library.exp(coordinate))
-        case _:
-            return coordinate
+    return library.exp(coordinate) if scale == "log" else coordinate
 
 
 def scale_width(parameter: FreeParameter) -> float:
@@ -248,16 +232,6 @@ def from_fractions(
     """Inverse of `to_fractions`."""
     start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
     return from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
-
-
-def gain_readings(gain: float) -> dict[str, float]:
-    """The half-life, s, of a gain per tick of 1/30 s, and its equivalents at other rates."""
-    per_tick, rate = jnp.asarray(gain), jnp.asarray(30.0)
-    readings = {"half_life": float(smoothing.half_life_of_gain(per_tick, rate))}
-    for hz in TICK_RATES:
-        fraction = smoothing.fraction_of_gain(per_tick, jnp.asarray(1.0 / hz), rate)
-        readings[f"gain_at_{hz:.0f}_hz"] = float(fraction)
-    return readings
 
 
 @dataclasses.dataclass(frozen=True)

@@ -157,7 +157,7 @@ def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Free
         content = validation.read_toml(path, "a free-parameter")
         _check_no_noise(content, text)
         check_table(content, {"free": Key(TABLE, "What is fitted.")}, text)
-        free = systems.read_free_table(content.get("free", {}), f"{text} [free]")
+        free = systems.read_free_table(content.get("free", {}), ik, f"{text} [free]")
     else:
         free = {name.strip(): {} for name in text.split(",") if name.strip()}
     if not free:

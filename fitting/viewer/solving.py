@@ -96,8 +96,6 @@ class Solver:
         result = self.animation.run(ik if size is None else similar(ik, size))
         result = jax.tree.map(np.asarray, result)
         solved = clip_from_result(own.clip, result, floor=own.floor, rise=own.root.rise)
-        if not np.isfinite(solved.positions_ws).all():
-            raise ValueError("these parameters give poses that are not finite")
         lines = overlays(result, solved, layers) if layers else {}
         soles, cost = own.soles(solved), None if cost is None else float(cost)
         return Solved(solved, soles, lines, cost, time.perf_counter() - began)

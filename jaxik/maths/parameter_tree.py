@@ -25,7 +25,7 @@ from .outline import ALL_LAYERS, outline, table, value_text
 Tree = TypeVar("Tree", bound=eqx.Module)
 Declared = TypeVar("Declared")  # whatever type a field is annotated with
 ParameterKind = Literal["smooth", "threshold"]
-Scale = Literal["linear", "log", "gain"]
+Scale = Literal["linear", "log"]
 Follows = Literal[
     "nothing", "leg length", "speed", "time",
     "ankle height", "ball height", "over ankle height", "over ball height",
@@ -82,7 +82,6 @@ class Declaration:
     kind: ParameterKind
     """a threshold moves a hard decision: its derivative there is zero."""
     scale: Scale
-    """a gain is fitted as its half-life."""
     above: str | None
     """Name of the field of the same rule that this one stays above."""
     doc: str
@@ -156,7 +155,7 @@ def parameter(
         doc: one sentence, for users, that says what the parameter does.
         unit: such as "m", "rad" or "1/s"; "1" for a plain number.
         kind: "threshold" if it moves a hard decision, so that its derivative there is zero.
-        scale: how a fit steps: "linear", by factors ("log"), or as the half-life of a "gain".
+        scale: how a fit steps: "linear", or by factors ("log").
         above: the field of the same rule that it stays above, if any.
         follows: what of a body it changes with, see `jaxik.world.body`; None takes that from the
             unit: lengths follow that of the legs, speeds its root, all else nothing.
@@ -183,11 +182,6 @@ threshold = functools.partial(parameter, kind="threshold")
 def half_life(default: int | float, doc: str) -> Declared:
     """Declares a half-life, s: fitted by factors from 2 ms to 0.5 s; at 0 memory jumps."""
     return parameter(default, 0.002, 0.5, doc, unit="s", scale="log")
-
-
-def gain_per_tick(default: int | float, doc: str) -> Declared:
-    """Declares a gain per tick, 0..1: fitted as its half-life; at 1 memory jumps."""
-    return parameter(default, 0.01, 0.95, doc, unit="1/tick", scale="gain")
 
 
 def constant(default: int | float, doc: str, *, unit: str) -> Declared:

@@ -1,10 +1,10 @@
 """Smoothing laws: how far a value moves towards its goal in `dt` seconds.
 
-A law gives the `fraction` 0..1 of the gap that it closes, and `lerp` closes it. Gain per tick and
-half-life are two notations of the same exponential, exact at any `dt`. Unreal's clamped speed
-depends on the frame rate and is kept that way. The critically damped spring is exact and also has
-a velocity. A weight that moves at constant speed closes its gap in steps (`move_towards`). What
-goes from 0 to 1 with something else than time follows `smoothstep`.
+A law gives the `fraction` 0..1 of the gap that it closes, and `lerp` closes it. The exponential,
+told by its half-life, is exact at any `dt`. Unreal's clamped speed depends on the frame rate and is
+kept that way. The critically damped spring is exact and also has a velocity. A weight that moves at
+constant speed closes its gap in steps (`move_towards`). What goes from 0 to 1 with something else
+than time follows `smoothstep`.
 """
 
 from typing import NamedTuple
@@ -44,16 +44,6 @@ def smoothstep(x: Array) -> Array:
 def clip_to_one(x: Array) -> Array:
     """`x` limited to 0..1, with zero gradient outside."""
     return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
-
-
-@vec.remat
-def fraction_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
-    """Fraction of the gap closed in `dt` s by a gain per tick of 1/`tick_hz` s.
-
-    `1 - (1 - gain)^(dt tick_hz)`. A gain of 1 jumps; its gradient is zero there.
-    """
-    damped = gain < 1
-    return jnp.where(damped, -jnp.expm1(dt * tick_hz * jnp.log1p(-jnp.where(damped, gain, 0))), 1.0)
 
 
 @vec.remat
@@ -162,23 +152,3 @@ def _spring(before: Motion, goal: Array, fraction: Array, dt: Array) -> Motion:
     value = goal + decay * (gap + pushed)
     velocity = decay * (before.velocity - rate * pushed)
     return Motion(jnp.where(damped, value, goal), jnp.where(damped, velocity, 0.0))
-
-
-def half_life_of_gain(gain: Array, tick_hz: Array) -> Array:
-    """Half-life, s, of a gain per tick; 0, with zero gradient, at gain 1; infinite at gain 0."""
-    damped = gain < 1
-    half_life = -LN2 / (tick_hz * jnp.log1p(-jnp.where(damped, gain, 0.5)))
-    return jnp.where(damped, half_life, 0.0)
-
-
-def gain_of_half_life(half_life: Array, tick_hz: Array) -> Array:
-    """Gain per tick of 1/`tick_hz` s with this half-life, s; 1 where it is 0 or less."""
-    return fraction_of_half_life(half_life, 1.0 / tick_hz)
-
-
-def half_life_of_speed(speed: Array, dt: Array) -> Array:
-    """Half-life, s, of Unreal's `FInterpTo` at this frame time; 0 where it jumps."""
-    fraction = jnp.clip(dt * speed, 0.0, 1.0)
-    damped = (fraction > 0) & (fraction < 1)
-    half_life = -LN2 * dt / jnp.log1p(-jnp.where(damped, fraction, 0.5))
-    return jnp.where(damped, half_life, 0.0)

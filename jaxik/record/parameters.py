@@ -1,6 +1,7 @@
 """What a record means: the parameters of the faithful record preset, in our names and units."""
 
 import dataclasses
+import math
 import warnings
 
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 
 from jaxik import presets
 from jaxik.maths import parameter_tree
+from jaxik.maths.smoothing import LN2
 from jaxik.pipeline import FootIK
 from jaxik.world.skeleton import Rig
 
@@ -25,7 +27,8 @@ class Reading:
         knee_convention: "interior" (pi is a straight leg) or "flexion" (0 is a straight leg).
         lean_sign: 1 if a positive rate aligns the body with the ground's normal, -1 if it leans
             into the hill.
-        tick_hz: the game's rate, to which all gains refer.
+        tick_hz: the game's rate. A gain is the part of a gap that closes in one of its ticks, and
+            so stands for a half-life.
     """
 
     length_unit: str = "auto"
@@ -60,9 +63,8 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
         values[ours] = _from_stored(name, stored, unit, record, reading)
     toe = [values.pop(f"probe.toe_ls[{axis}]") for axis in range(3)]
     switches = {ours: record.flag(name) for _, name, ours in FLAGS}
-    ticks = {name: reading.tick_hz for name in ("lean.tick_hz", "pelvis.tick_hz")}
     return parameter_tree.replace(
-        presets.record(faithful=True), values | {"probe.toe_ls": toe} | switches | ticks
+        presets.record(faithful=True), values | {"probe.toe_ls": toe} | switches
     )
 
 
@@ -178,6 +180,18 @@ def _fields(reading: Reading) -> list[tuple[str, str, str]]:
     return [(name, other.get(ours, ours), unit) for name, ours, unit in FLOATS]
 
 
+def half_life_of_gain(gain: float, tick_hz: float) -> float:
+    """Half-life, s, of a gain per tick: infinite for a gain of 0 or less, 0 for 1 or more."""
+    if gain <= 0.0:
+        return math.inf
+    return -LN2 / (tick_hz * math.log1p(-gain)) if gain < 1.0 else 0.0
+
+
+def gain_of_half_life(half_life: float, tick_hz: float) -> float:
+    """Gain per tick of 1/`tick_hz` s of a half-life, s: 1 for a half-life of 0 or less."""
+    return -math.expm1(-LN2 / (tick_hz * half_life)) if half_life > 0.0 else 1.0
+
+
 def _shared_value(ik: FootIK, name: str) -> float:
     """The value of a parameter, which must be the same for all legs."""
     leaf, _, index = name.rstrip("]").partition("[")
@@ -195,7 +209,7 @@ def _in_centimetres(record: Record) -> bool:
 
 
 def _from_stored(name: str, value: float, unit: str, record: Record, reading: Reading) -> float:
-    """A stored number in our units: metres, radians, gains per tick."""
+    """A stored number in our units: metres, radians, seconds."""
     if unit == "length":
         if reading.length_unit == "cm":
             return value / 100.0
@@ -209,6 +223,12 @@ def _from_stored(name: str, value: float, unit: str, record: Record, reading: Re
         else:
             angle = np.arccos(value)
         return float(angle if reading.knee_convention == "interior" else np.pi - angle)
+    if unit == "gain":
+        if not 0.0 <= value <= 1.0:
+            warnings.warn(
+                f"{name} = {value} is not a gain, 0 to 1; the nearest is read", stacklevel=3
+            )
+        return half_life_of_gain(value, reading.tick_hz)
     if unit == "deg":
         return float(np.radians(value))
     if unit == "lean":
@@ -222,6 +242,8 @@ def _to_stored(value: float, unit: str, reading: Reading) -> float:
         return value * 100.0
     if unit == "cosine":
         return float(np.cos(value if reading.knee_convention == "interior" else np.pi - value))
+    if unit == "gain":
+        return gain_of_half_life(value, reading.tick_hz)
     if unit == "deg":
         return float(np.degrees(value))
     if unit == "lean":

@@ -11,11 +11,11 @@ over ankle height     as far over the ankle of a flat foot as the adult's number
                       the feet's length: a heel rises by the length of its foot, whatever the leg;
                       `over ball height` likewise
 
-Gains, half-lives, angles and parts of a length follow nothing.
+Half-lives, angles and parts of a length follow nothing.
 
 Of a body of the same shape, with legs r times as long, `similar` knows all numbers by their units,
 half-lives too: lengths are r, times and speeds root r times as large, and rates the inverse of
-that. A gain per tick stays, and so keeps its half-life in ticks, which are longer.
+that.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ BALL = 0.055  # m, likewise
 FOOT = 0.12  # m, from ankle to ball
 FOOT_RANGE = 2.0  # factor by which feet may be larger or smaller than their legs say
 NOTICEABLE = 0.05  # of their mean, from which legs get values of their own
-DIMENSIONS = {"m": 1.0, "s": 0.5, "Hz": -0.5, "rad": 0.0, "tick": 0.0, "1": 0.0}  # powers of r
+DIMENSIONS = {"m": 1.0, "s": 0.5, "Hz": -0.5, "rad": 0.0, "1": 0.0}  # powers of r
 POWERS = {"": 1, "²": 2, "³": 3}
 
 Tree = TypeVar("Tree", bound=eqx.Module)

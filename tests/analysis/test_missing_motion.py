@@ -156,7 +156,7 @@ RECORD = {  # clip and ground without the motion, what is said, and with it
     "leg.min_knee_angle": ("walks", FLAT, "a knee bent", "walks", "step 0.3"),
     "lock.release_distance": ("walks", FLAT, "by more than 0.0", "slips", FLAT),
     "lock.max_speed": ("stands", FLAT, "a foot that comes down", "walks", FLAT),
-    "pelvis.off_gain": ("walks", "level -0.1", "a run", "runs", "level -0.1"),
+    "pelvis.airborne_half_life": ("walks", "level -0.1", "a run", "runs", "level -0.1"),
     "lock.lock_half_life": ("stands", FLAT, "still move", "walks", FLAT),
     "lock.unlock_half_life": ("stands", FLAT, "released", "walks", FLAT),
     "target.rise_half_life": ("walks", "step -0.1", "slopes up", "walks", "step 0.1"),

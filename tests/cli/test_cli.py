@@ -214,7 +214,7 @@ def test_a_mistake_is_reported_and_nothing_written(tmp_path, capsys, monkeypatch
     monkeypatch.chdir(tmp_path)
     files = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
     files |= {"bad.bvh": "hi", "bad.npz": "hi", "legs.toml": "foot.max_roll = [1, 2, 3]"}
-    files |= {"step.bvh": BVH, "mad.toml": f"{ORIGINAL}pelvis.tick_hz = -inf\nleg.soften = inf\n"}
+    files |= {"step.bvh": BVH, "mad.toml": f"{ORIGINAL}lean.forward_rate = inf\n"}
     files |= {"broken.toml": "lock = [[", "odd.toml": "lock.max_speed = 'x'"}
     files["legless.bvh"] = BVH.replace("Left", "A").replace("Right", "B")
     for name, text in files.items():

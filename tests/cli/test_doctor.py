@@ -81,15 +81,15 @@ def test_the_advice_on_a_variable_of_jax_is_to_unset_it(tmp_path):
 @pytest.mark.slow
 def test_the_self_test_passes_here():
     finding = self_test.examine()
-    assert not finding.problem and "pelvis.on_gain = 0.15" in finding.fact
+    assert not finding.problem and "pelvis.half_life = 0.142" in finding.fact
 
 
 def test_the_self_test_fits_one_parameter_of_a_clip_whose_truth_is_known(monkeypatch):
     monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
     finding = self_test.examine()
-    assert re.search(r"a fit \(pelvis.on_gain = 0\.(3|29\d*|30\d*)\) in ", finding.fact)
+    assert re.search(r"a fit \(pelvis.half_life = 0\.(3|29\d*|30\d*)\) in ", finding.fact)
     assert "the motion has a cost of" in finding.problem and "wanted 4348" in finding.problem
-    assert re.search(r"the fit found pelvis.on_gain = 0.\d+, wanted 0.15$", finding.problem)
+    assert re.search(r"the fit found pelvis.half_life = 0.\d+, wanted 0.142167$", finding.problem)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_the_self_test_fits_one_parameter_of_a_clip_whose_truth_is_known(monkeyp
         (0.989, 2.0, 0.0, "the motion has a cost of 4300"),
         (1.0, 0.0, 0.0, "derivatives are 0 or not finite"),
         (1.0, np.nan, 0.0, "derivatives are 0 or not finite"),
-        (1.0, 2.0, 4.1, "the fit found pelvis.on_gain = 2.05, wanted 0.15"),
+        (1.0, 2.0, 4.1, "the fit found pelvis.half_life = 2.05, wanted 0.142167"),
     ],
 )
 def test_the_self_test_sees_wrong_numbers(cost, slope, errors, problem, monkeypatch):

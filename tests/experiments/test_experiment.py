@@ -56,7 +56,7 @@ def test_missing_keys_have_defaults_which_are_not_written_and_paths_are_relative
     loaded = load(tmp_path, name="hill.toml")
     assert loaded.name == "hill" and loaded.fps is None and loaded.parameters == {}
     assert loaded.fit == FitOptions() and loaded.sample == SamplerSettings()
-    assert loaded.free == {"pelvis.on_gain": {}, "foot.max_pitch": {"low": 0.1}}
+    assert loaded.free == {"pelvis.half_life": {}, "foot.max_pitch": {"low": 0.1}}
     text = experiment_files.experiment_to_toml(loaded)
     assert "[fit]\nstarts = 6\nmax_steps = 1000\n" in text and "[fit.search]" not in text
     assert "[sample]\nmax_steps = 20000\nthin_by = 1\nstop_at = 50.0\n" in text
@@ -72,7 +72,7 @@ def test_missing_keys_have_defaults_which_are_not_written_and_paths_are_relative
 
 def test_what_does_not_fit_the_clip_or_the_system_makes_no_problem(tmp_path):
     for rest, message in (
-        ("lean.gain = [0.1, 0.2]", r"lean.gain has shape \(2,\), wanted \(\)"),
+        ("lean.half_life = [0.1, 0.2]", r"lean.half_life has shape \(2,\), wanted \(\)"),
         ("foot.max_roll = [1, 2, 3]", r"max_roll has shape \(3,\), .* \(2,\), one per leg"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -106,8 +106,8 @@ def test_a_problem_has_the_clips_cut_and_resampled_alike_and_starts_at_the_value
     space, (scene,) = problem.space, problem.data
     assert not parameter_tree.get(space.system, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(space.system, "foot.max_pitch"), [0.3, 0.5])
-    gain = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
-    assert space.names == ("pelvis.on_gain", "foot.max_pitch")
+    gain = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
+    assert space.names == ("pelvis.half_life", "foot.max_pitch")
     np.testing.assert_allclose(space.values(space.start), [gain, 0.4], rtol=1e-6)
     assert scene.frames.dt.shape == (16,) and float(scene.frames.dt[0]) == pytest.approx(1 / 15)
     frames = slice(30, 61, 2)
@@ -185,7 +185,7 @@ SETTINGS = """
 fit = { starts = 2, max_steps = 50, search = { elite = 4, agreement = 1 } }
 sample = { max_steps = 300, check_every = 30 }
 prior.shape = "uniform"
-prior.pelvis.on_gain = { shape = "normal", centre = 0.3, spread = 1.0 }
+prior.pelvis.half_life = { shape = "normal", centre = 0.3, spread = 1.0 }
 start.foot.max_pitch = 0.5
 """
 
@@ -198,7 +198,7 @@ def test_settings_priors_and_start_are_those_of_the_file_and_are_written_back(tm
     np.testing.assert_array_equal(space.prior.uniform, [False, True])
     np.testing.assert_allclose(space.prior.spread, 1.0)
     assert float(space.values(space.prior.centre)[0]) == pytest.approx(0.3)
-    preset = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
+    preset = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
     np.testing.assert_allclose(space.values(space.start), [preset, 0.5])
     path = tmp_path / "again.toml"
     path.write_text(experiment_files.experiment_to_toml(loaded))
@@ -209,10 +209,10 @@ def test_settings_priors_and_start_are_those_of_the_file_and_are_written_back(tm
         ("shape = 'uniform'", ParameterPrior("uniform")),
         ("centre = 0.1", ParameterPrior(centre=0.1, spread=0.7)),
     ):
-        rest = f"[prior]\nspread = 0.7\n[prior.pelvis]\non_gain = {{ {table} }}"
+        rest = f"[prior]\nspread = 0.7\n[prior.pelvis]\nhalf_life = {{ {table} }}"
         prior = load(tmp_path, rest=rest).prior
         assert prior.of("foot.max_pitch") == ParameterPrior(spread=0.7)
-        assert prior.of("pelvis.on_gain") == expected
+        assert prior.of("pelvis.half_life") == expected
     # Also one that only a variant frees.
     variant = "[[without]]\nname = 'x'\nfree = { pelvis.limit = {} }"
     prior = "[prior.pelvis]\nlimit = { shape = 'uniform' }\n[start]\npelvis.limit = 0.2"
@@ -271,7 +271,7 @@ def test_the_root_follows_a_hill_unless_it_stays_as_animated_or_its_system_puts_
 
 # In memory
 
-NAMES = ("pelvis.on_gain", "foot.max_pitch")
+NAMES = ("pelvis.half_life", "foot.max_pitch")
 
 
 class MemoryPelvis(LowestPelvis):
@@ -286,9 +286,9 @@ def second(objects) -> ClipEntry:
 
 
 def test_objects_make_the_problem_that_their_files_make(second, tmp_path):
-    path = write(tmp_path, free="pelvis.on_gain = {}\nfoot.max_pitch = {}")
+    path = write(tmp_path, free="pelvis.half_life = {}\nfoot.max_pitch = {}")
     of_files = problems.make_problem(experiment_files.load_experiment(path))
-    free = ["pelvis.on_gain", lambda ik: ik.foot.max_pitch]
+    free = ["pelvis.half_life", lambda ik: ik.foot.max_pitch]
     assert digest(problems.make_problem(make_experiment(second, free=free))) == digest(of_files)
 
 

@@ -87,13 +87,13 @@ def load(tmp_path, table: str, *subjects: str | None, top: str = ""):
 
 
 def test_a_hierarchy_is_read_and_written_again_and_without_one_nothing_is_scaled(tmp_path):
-    table = 'per_subject = ["foot.max_pitch"]\nper_clip = ["pelvis.on_gain"]\n'
+    table = 'per_subject = ["foot.max_pitch"]\nper_clip = ["pelvis.half_life"]\n'
     experiment = load(tmp_path, table + "scale_with_body = true", "ann", "ben", "ann")
-    assert experiment.hierarchy == Hierarchy(("foot.max_pitch",), ("pelvis.on_gain",), True)
+    assert experiment.hierarchy == Hierarchy(("foot.max_pitch",), ("pelvis.half_life",), True)
     (tmp_path / "again.toml").write_text(experiment_to_toml(experiment))
     again = load_experiment(tmp_path / "again.toml")
     assert again.hierarchy == experiment.hierarchy and again.clips == experiment.clips
-    names = ("pelvis.on_gain", "leg.soften", "foot.max_pitch")
+    names = ("pelvis.half_life", "leg.soften", "foot.max_pitch")
     grouping = experiment.hierarchy.grouping(names, ("x", "y", "z"), ("ann", "ben", "ann"))
     np.testing.assert_array_equal(grouping.group, [[0, -1, 0], [1, -1, 1], [2, -1, 0]])
     without = load(tmp_path, "", None)
@@ -235,9 +235,9 @@ def test_a_wrong_track_file_and_a_free_parameter_on_a_track_are_refused(clip, tm
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             track_files.along(clip, path)
-    path.write_text("[pelvis.on_gain]\ntimes = [0.0]\nvalues = [0.2]\n")
+    path.write_text("[pelvis.half_life]\ntimes = [0.0]\nvalues = [0.2]\n")
     experiment = load_experiment(write(tmp_path, clip='tracks = "tracks.toml"\n'))
-    with pytest.raises(ValueError, match=r"\['pelvis.on_gain'\] cannot be free: a track of"):
+    with pytest.raises(ValueError, match=r"\['pelvis.half_life'\] cannot be free: a track of"):
         make_problem(experiment)
 
 
@@ -285,11 +285,11 @@ def test_the_cost_follows_the_track(tmp_path):
         tmp_path,
         top="faithful = true",  # its pelvis follows ankles far enough for the limit to act
         clip='tracks = "tracks.toml"\nmask_pops = false\n',
-        free="pelvis.on_gain = {}\n",
+        free="pelvis.half_life = {}\n",
     )
     problem = make_problem(load_experiment(path))
     (scene,) = problem.data
-    truth = problem.space.pack({"pelvis.on_gain": 0.35})
+    truth = problem.space.pack({"pelvis.half_life": 0.35})
 
     @jax.jit
     def motion_and_cost(problem):

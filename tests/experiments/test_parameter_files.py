@@ -17,6 +17,7 @@ from fitting.experiment.originals import ORIGINALS
 from fitting.experiment.systems import DEFAULT_PRESET, Preset, leaf_names
 from jaxik import FootIK, presets
 from jaxik.maths import parameter_tree
+from jaxik.record.parameters import half_life_of_gain
 from jaxik.stages.lean import NoLean
 from support.clips import ODD
 from support.experiments import write
@@ -39,7 +40,7 @@ def assert_same_system(ik: FootIK, expected: FootIK) -> None:
 
 
 def test_everything_is_read_back_exactly_and_what_is_missing_is_that_of_the_preset(tmp_path):
-    odd = ODD | {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.tick_hz": jnp.array(60.0)}
+    odd = ODD | {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.limit": jnp.array(0.2)}
     odd |= {"leg.soften": jnp.nextafter(jnp.array(0.9), jnp.array(1.0))}
     ik = parameter_tree.replace(presets.record(faithful=True), odd)
     text = parameter_files.system_to_toml(ik, FAITHFUL)
@@ -65,6 +66,31 @@ def test_options_are_read_back_and_only_true_or_false(tmp_path):
     assert parameter_tree.options(back).keys() - on == {"probe.limited", "probe.slide_to_support"}
     with pytest.raises(ValueError, match="probe.limited is 0; wanted true or false"):
         parameter_files.load_system(write_file(tmp_path, "probe.limited = 0"))
+
+
+def test_gains_of_an_earlier_release_are_half_lives(tmp_path):
+    for text, tick_hz in (("", 30.0), ("pelvis.tick_hz = 60.0\n", 60.0)):
+        ik, _ = parameter_files.load_system(write_file(tmp_path, f"{text}pelvis.on_gain = 0.2"))
+        half_life = float(parameter_tree.get(ik, "pelvis.half_life"))
+        assert half_life == pytest.approx(half_life_of_gain(0.2, tick_hz))
+    for text, message in (
+        ("pelvis.on_gain = nan", "pelvis.half_life is nan; wanted a number"),
+        ("pelvis.on_gain = true", "pelvis.half_life is True; wanted a number"),
+        ("preset = 'stride'\npelvis.on_gain = 0.1", "unknown key 'pelvis.on_gain'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            parameter_files.load_system(write_file(tmp_path, text))
+    fixed = "lean.slide_off_gain = 0.1\nlean.tick_hz = 60.0"
+    free = "pelvis.on_gain = { high = 0.5 }\nlean.gain = {}"
+    experiment = experiment_files.load_experiment(
+        write(tmp_path, free=free, rest=f"[parameters]\n{fixed}")
+    )
+    assert experiment.parameters == {"lean.slide_off_half_life": half_life_of_gain(0.1, 60.0)}
+    low, high = (half_life_of_gain(gain, 30.0) for gain in (0.95, 0.01))
+    assert experiment.free == {
+        "pelvis.half_life": {"low": half_life_of_gain(0.5, 30.0), "high": high},
+        "lean.half_life": {"low": low, "high": high},
+    }
 
 
 def test_a_mistake_is_reported_with_what_was_wanted(tmp_path):

@@ -27,8 +27,8 @@ WORDS = (
 )  # fmt: skip
 ODD_VALUES = (
     0, -1, 1, 3, 10**10, 10**400, 2**63 - 1, 0.0, 0.3, -0.5, 1e-300, 1e300, float("nan"),
-    float("inf"), -float("inf"), True, False, "", "x", "\0", "lean.gain", [], {}, [[]], [1.0, 2.0],
-    [1, "x"], [[0.5, 0.4]], {"x": 1}, {"low": 0.1}, [{}], "x" * 10_000,
+    float("inf"), -float("inf"), True, False, "", "x", "\0", "lean.half_life", [], {}, [[]],
+    [1.0, 2.0], [1, "x"], [[0.5, 0.4]], {"x": 1}, {"low": 0.1}, [{}], "x" * 10_000,
 )  # fmt: skip
 BLOCKS = (b"\0", b"\xff", b"\0" * 16, b"\xff" * 8, b"\xff\xfe", b"\r\n", b"\n\n", b"\x1b[2J")
 VALUES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-320, 1e20, 1e308, 2**62)

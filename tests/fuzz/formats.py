@@ -61,7 +61,7 @@ values = [[0.5, 0.4]]
 """
 FREE = """
 [free]
-lean.gain = {}
+lean.half_life = {}
 target.foot_height = { low = 0.0, high = 0.2 }
 "foot.max_pitch" = { low = 0.1, kind = "smooth", scale = "log" }
 """
@@ -94,7 +94,7 @@ name = "locks"
 parameters = { lock.enabled = false }
 free = { pelvis.limit = {} }
 """
-FITTED = {"name": "lean.gain", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 0.2}
+FITTED = {"name": "lean.half_life", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 0.2}
 RUN = {"parameters": [FITTED | {"determined": True}]}
 
 

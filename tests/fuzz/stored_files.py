@@ -32,7 +32,7 @@ from support.watching import listening
 
 SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)
 PARAMETER = {
-    **{"name": "lean.gain", "kind": "smooth", "unit": "1", "u": 0.5, "start_sd": 0.1},
+    **{"name": "lean.half_life", "kind": "smooth", "unit": "1", "u": 0.5, "start_sd": 0.1},
     **{"value": 0.2, "before": 0.1, "low": 0.0, "high": 1.0, "interval": [0.1, 0.3]},
     **{"verdict": "two-sided", "contraction": 0.9, "at_bound": "", "determined": True},
     "prior": {"shape": "normal", "centre": 0.1, "spread": 1.6, "interval": [0.05, 0.9]},
@@ -42,11 +42,11 @@ ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
 SEARCH = ENDING | {"cost_before": 99.5, "cost": 10.5, "steps": 8, "starts": 2, "agreeing": 2}
 REPLICATE = SEARCH | {"number": 0, "parameters": [PARAMETER]}
 FIT = {"truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "truth_valley_cost": 10.0}
-CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, LOG_PROBABILITY: 3}}
-CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
+CHAIN = {"number": 0, "ranks": {"lean.half_life": DRAWS // 2, LOG_PROBABILITY: 3}}
+CHAIN |= {"intervals": {"lean.half_life": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
 DISTANCES = {motion: dict.fromkeys(CLOSE, 0.02) for motion in MOTIONS}
 JUDGEMENT = {"fits": True, "sentence": "Fits.", "distances": dict.fromkeys(PARTS, DISTANCES)}
-WRONG_MODEL = {"truth_values": {"lean.gain": 0.2}, "errors": {"drift": 0.01}}
+WRONG_MODEL = {"truth_values": {"lean.half_life": 0.2}, "errors": {"drift": 0.01}}
 WRONG_MODEL |= dict.fromkeys(("captured", "lasting", "noise_free"), JUDGEMENT)
 REPLICATES = {
     "fits": REPLICATE | FIT,
@@ -114,7 +114,7 @@ def load_found(path: Path) -> None:
 def rows_text() -> bytes:
     names = [field.name for field in dataclasses.fields(Accuracy)]
     accuracy = Accuracy(**{name: 0.01 * place for place, name in enumerate(names)})
-    row = Row("0123abcd", "locks", 1, accuracy, {"lean.gain": 0.2}, cast(Any, SEARCH))
+    row = Row("0123abcd", "locks", 1, accuracy, {"lean.half_life": 0.2}, cast(Any, SEARCH))
     return text_of({"rows": [dataclasses.asdict(row)]})
 
 
@@ -127,5 +127,5 @@ def load_rows(path: Path) -> None:
 def load_replicate(path: Path) -> None:
     """As `jaxik calibrate` reads it."""
     kind, folder = KINDS[path.parent.name], path.parents[1]
-    (result,) = make_replicates(kind, folder, ["lean.gain"], _refuse, [0])
+    (result,) = make_replicates(kind, folder, ["lean.half_life"], _refuse, [0])
     assert result["number"] == 0 and isinstance(result["seconds"], float)

@@ -88,7 +88,7 @@ REFUSED: dict[str, list[Change]] = {
     "parameters": [text(b"layers = 4294967295", b"layers = inf")],
     "free parameters": [
         text(b"low = 0.0", b"low = 1" + DIGITS),
-        text(b"lean.gain", b"lean.gian"),  # a free parameter in no file
+        text(b"lean.half_life", b"lean.gian"),  # a free parameter in no file
     ],
     "tracks": [text(b"[[0.5, 0.4]]", b"[[]]"), text(b"0.5]", b"1" + DIGITS + b"]")],
     "experiment": [

@@ -67,7 +67,14 @@ def assessed(kind: type, truth: dict[str, float], seed: int) -> Assessed:
 # Exact profiles
 
 
-COUPLED = ("body.gain", "body.drop", "body.rise", "foot.share", "foot.limit[0]", "foot.half_life")
+COUPLED = (
+    "body.half_life",
+    "body.drop",
+    "body.rise",
+    "foot.share",
+    "foot.limit[0]",
+    "foot.half_life",
+)
 
 
 @functools.cache
@@ -120,7 +127,7 @@ def test_a_profile_is_the_exact_one_where_the_cost_is_low_and_at_the_ends_of_its
 
 # Heights of intervals: chi-square's, or higher beside a plateau that noise undercuts
 
-GAIN = free_parameter(toy.Toy(), "body.gain")
+GAIN = free_parameter(toy.Toy(), "body.half_life")
 U = np.unique(np.concatenate([np.linspace(-6, 6, 241), np.linspace(-0.02, 0.02, 21)]))
 
 

@@ -20,7 +20,6 @@ from jaxik.maths.parameter_tree import (
     Leaf,
     Rule,
     angle,
-    gain_per_tick,
     half_life,
     length,
     parameter,
@@ -78,7 +77,6 @@ HIGH = "Height above which the foot is lifted."
 class Lift(Rule):
     height: Leaf = length(0.1, 0, 0.5, "Height of the foot.")
     top: Leaf = threshold((0.2, 0.3), 0, 1, HIGH, unit="m", above="height")
-    gain: Leaf = gain_per_tick(0.5, "Part of the gap closed in each tick.")
     half_life: Leaf = half_life(0.1, "Time in which half of the gap closes.")
     tick_hz: Leaf = parameter_tree.constant(30, "Ticks per second.", unit="Hz")
     early: Leaf = parameter_tree.switch(True, "Whether the foot is lifted early.")
@@ -98,15 +96,15 @@ def test_parameters_and_constants_become_floats_and_switches_booleans():
     assert lift.early.dtype == bool and lift.early.shape == ()
     assert_allclose(lift.top, [0.2, 0.3])
     assert lift.layers.dtype == jnp.uint32
-    assert len(jax.tree.leaves(lift)) == 7
+    assert len(jax.tree.leaves(lift)) == 6
     assert lift.height is not Lift().height, "rules share no defaults"
 
 
 def test_what_a_user_gives_is_converted_and_arrays_stay_as_they_are():
     single = jnp.asarray(0.25, jnp.float32)
-    lift = Lift(height=1, top=[1, 2], gain=single, early=0)
+    lift = Lift(height=1, top=[1, 2], half_life=single, early=0)
     assert lift.height.dtype == lift.top.dtype == jnp.result_type(float)
-    assert lift.gain is single
+    assert lift.half_life is single
     assert not lift.early
 
 
@@ -124,7 +122,7 @@ def test_a_rule_can_be_made_and_changed_with_traced_values():
 
 def test_declarations_list_the_parameters_in_order_and_nothing_else():
     declared = parameter_tree.declarations(Walk())
-    lift = ["lift.height", "lift.top", "lift.gain", "lift.half_life"]
+    lift = ["lift.height", "lift.top", "lift.half_life"]
     assert list(declared) == [*lift, "max_angle", "speed"]
     declaration = parameter_tree.Declaration
     assert declared["lift.height"] == declaration(
@@ -133,16 +131,16 @@ def test_declarations_list_the_parameters_in_order_and_nothing_else():
     assert declared["lift.top"] == declaration(
         "m", 0.0, 1.0, "threshold", "linear", "height", HIGH, "leg length"
     )
-    gain, half_life = declared["lift.gain"], declared["lift.half_life"]
-    assert (gain.unit, gain.scale) == ("1/tick", "gain")
+    half_life = declared["lift.half_life"]
     assert (half_life.unit, half_life.scale) == ("s", "log")
+    assert (half_life.low, half_life.high) == (0.002, 0.5)
 
 
 def test_everything_declared_has_a_sentence_of_meaning():
     docs = parameter_tree.docs(Walk())
     assert docs["lift.height"] == "Height of the foot."
     assert docs["lift.early"] == "Whether the foot is lifted early."
-    assert list(docs)[-3:] == ["lift.layers", "max_angle", "speed"] and len(docs) == 9
+    assert list(docs)[-3:] == ["lift.layers", "max_angle", "speed"] and len(docs) == 8
     with pytest.raises(TypeError, match="doc"):
         parameter(0.1, 0, 0.5, unit="m")  # pyright: ignore[reportCallIssue]
     # So that `help` lists them.
@@ -155,7 +153,6 @@ Walk
   lift       Lift
     height     0.1 m
     top        [0.2, 0.3] m
-    gain       0.5 1/tick
     half_life  0.1 s
     tick_hz    30 Hz
     early      on
@@ -197,7 +194,7 @@ def test_replacing_leaves_changes_these_and_no_others():
     before = Walk()
     after = parameter_tree.replace(before, {"lift.height": 0.4, "speed": 2, "lift.early": False})
     assert (after.lift.height, after.speed, after.lift.early) == (0.4, 2.0, False)
-    assert after.lift.gain is before.lift.gain and before.lift.height == 0.1
+    assert after.lift.half_life is before.lift.half_life and before.lift.height == 0.1
     assert parameter_tree.get(after, "lift.height") is after.lift.height
     assert parameter_tree.replace(before, {}) == before
 
@@ -211,6 +208,6 @@ def test_a_replaced_leaf_keeps_its_precision_and_may_become_one_a_leg():
 
 @pytest.mark.parametrize("name", ["lift.hight", "lft.height", "lift", "speed.height", ""])
 def test_a_name_that_is_not_there_is_answered_with_those_that_are(name):
-    with pytest.raises(ValueError, match="lift.height.*lift.top.*lift.gain.*speed") as caught:
+    with pytest.raises(ValueError, match="lift.height.*lift.top.*lift.half_life.*speed") as caught:
         parameter_tree.replace(Walk(), {name: 1.0})
     assert repr(name) in str(caught.value)

@@ -332,10 +332,9 @@ ARGUMENTS = {
         "nlerp_half": (S, T, S), "angle": (M, N),
     },
     smoothing: {
-        "lerp": (S, -S, S), "fraction_of_gain": (S, S, 30 * S), "fraction_of_half_life": (S, S),
+        "lerp": (S, -S, S), "fraction_of_half_life": (S, S),
         "fraction_of_speed": (S, S, S), "spring": (MOTION, 2 * S, S, S),
-        "follow": (MOTION, 2 * S, S, S, S > 0.3), "half_life_of_gain": (S, 30 * S),
-        "gain_of_half_life": (S, 30 * S), "half_life_of_speed": (S, S),
+        "follow": (MOTION, 2 * S, S, S, S > 0.3),
     },
 }  # fmt: skip
 DECISIONS = {

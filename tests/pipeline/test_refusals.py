@@ -92,7 +92,7 @@ def test_each_parameter_is_refused_per_leg_or_gives_results_of_the_right_shapes(
         ("probe.ray_up", [0.1, 0.2, 0.3], "shape (3,), wanted (), the same for all legs, or (2,)"),
         ("probe.toe_ls", [0.1, 0.2], "shape (2,), wanted (3,), the same for all legs, or (2, 3)"),
         ("lock.enabled", [[True, False]], "shape (1, 2), wanted ()"),
-        ("lean.tick_hz", [30.0], "shape (1,), wanted (), the same for all legs;"),
+        ("lean.half_life", [0.1], "shape (1,), wanted (), the same for all legs;"),
     ],
 )
 def test_every_way_in_names_the_parameter_and_what_it_may_be(name, value, message):

@@ -36,7 +36,7 @@ from fitting.problem.space import (
     make_space,
     prior_probability,
 )
-from jaxik.maths import parameter_tree, smoothing
+from jaxik.maths import parameter_tree
 from support import toy
 from support.problems import Fractions, problem_of
 
@@ -56,7 +56,9 @@ def make(*names: str, priors: Priors | None = None, **overrides) -> Space:
 
 
 def test_values_stay_in_their_bounds_and_order_and_packing_gives_u_again():
-    space = make("lock.height_off", "lock.height_on", "body.gain", "foot.limit[1]", "lock.release")
+    space = make(
+        "lock.height_off", "lock.height_on", "body.half_life", "foot.limit[1]", "lock.release"
+    )
 
     @jax.jit
     @jax.vmap
@@ -80,11 +82,7 @@ def test_values_stay_in_their_bounds_and_order_and_packing_gives_u_again():
     assert above_fixed[0] == pytest.approx(0.06)
 
 
-def test_the_middle_of_a_gain_or_a_logarithmic_range_is_a_geometric_one():
-    gain = make("body.gain").values(jnp.zeros(1))[0]
-    ends = smoothing.half_life_of_gain(jnp.asarray([0.02, 0.9]), jnp.asarray(30.0))
-    middle = smoothing.half_life_of_gain(gain, jnp.asarray(30.0))
-    np.testing.assert_allclose(middle, jnp.sqrt(ends[0] * ends[1]), rtol=TOLERANCE)
+def test_the_middle_of_a_logarithmic_range_is_a_geometric_one():
     value = make("lock.release").values(jnp.zeros(1))[0]
     np.testing.assert_allclose(value, np.sqrt(0.01 * 0.5), rtol=TOLERANCE)
 
@@ -301,7 +299,6 @@ def test_other_data_bounds_starts_priors_and_weights_do_not_compile_again():
         ("foot.share", {"low": 2.0}, "bounds are 2.0 to 1.2"),
         ("foot.share", {"low": float("nan")}, "low is nan; wanted a finite number"),
         ("lock.release", {"low": 0.0}, "strictly between 0.0"),
-        ("body.gain", {"high": 1.0}, "and 0.999999999 for the scale 'gain'"),
         ("foot.share", {"prior_sd": 1.0}, "unknown key .prior_sd.; nearest is"),
         ("foot.share", {"scale": "square"}, "scale is 'square'"),
         ("foot.share", {"kind": "soft"}, "kind is 'soft'"),

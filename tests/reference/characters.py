@@ -20,23 +20,25 @@ def named(stage: str, **values: Any) -> dict[str, Any]:
     return {f"{stage}.{name}": value for name, value in values.items()}
 
 
-# Defaults of the `record` system for a 1.8 m adult; gains per tick of 30 Hz.
+# Defaults of the `record` system for a 1.8 m adult; half-lives are those of gains per tick of
+# 30 Hz: lean 0.19, slide 0.294, on 0.226, off 0.135; pelvis 0.225, airborne 0.116.
 DEFAULTS = (
     named("contact", ground_height=0.0, planted_height=0.10, raised_height=0.16)
     | named("probe", ray_up=0.50, ray_down=0.80, use_toe=True, toe_ls=np.array([0.0, -0.07, 0.20]))
     | named("target", min_ankle_height=-0.30, max_ankle_height=0.55, foot_height=0.08)
     | named("target", max_slope=math.radians(60.0), rise_half_life=0.0, fall_half_life=0.0)
     | named("target", spring=False, follow_slopes=False, max_penetration=math.inf)
-    | named("lean", forward_rate=-0.30, side_rate=-0.10, gain=0.19, tick_hz=30.0, spring=False)
-    | named("lean", forward_rate_slide=0.80, side_rate_slide=0.60, gain_slide=0.294)
-    | named("lean", slide_on_gain=0.226, slide_off_gain=0.135)
+    | named("lean", forward_rate=-0.30, side_rate=-0.10, half_life=0.1096, spring=False)
+    | named("lean", forward_rate_slide=0.80, side_rate_slide=0.60)
+    | named("lean", half_life_slide=0.06637, slide_on_half_life=0.09019)
+    | named("lean", slide_off_half_life=0.1593)
     | named("lock", enabled=True, lock_half_life=0.05, unlock_half_life=0.10, max_speed=math.inf)
     | named("lock", release_min_angle=math.radians(50.0), release_max_angle=math.radians(172.0))
     | named("lock", release_cone=math.radians(25.0), release_distance=0.20, relock_threshold=0.20)
     | named("lock", release_heading=math.pi, release_speed=math.inf, return_speed=math.inf)
     | named("lock", hold_ball=False)
-    | named("pelvis", limit=0.30, on_gain=0.225, off_gain=0.116, tick_hz=30.0)
-    | named("pelvis", vertical_only=True, wait_to_rise=False, min_extension=0.0)
+    | named("pelvis", half_life=0.09065, airborne_half_life=0.1874)
+    | named("pelvis", limit=0.30, vertical_only=True, wait_to_rise=False, min_extension=0.0)
     | named("leg", max_knee_angle=math.acos(-0.990), min_knee_angle=math.acos(0.766))
     | named("leg", soften=1.0, twist=0.0, weight=1.0, as_animated=False)
     | named("foot", max_pitch=0.52, min_pitch=-0.79, max_roll=0.26, min_roll=-0.52)

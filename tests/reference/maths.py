@@ -151,11 +151,6 @@ def clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-def fraction_of_gain(gain: float, tick_hz: float, dt: float) -> float:
-    """Fraction of the gap closed in `dt` s by a gain per tick; a gain of 1 or more jumps."""
-    return 1.0 if gain >= 1.0 else 1.0 - (1.0 - gain) ** (dt * tick_hz)
-
-
 def fraction_of_half_life(half_life: float, dt: float) -> float:
     """Fraction of the gap closed in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
     return 1.0 if half_life <= 0.0 else 1.0 - 2.0 ** (-dt / half_life)

@@ -50,12 +50,12 @@ from support.pages import Page
 from support.problems import posterior_of, problem_of
 from support.profiles import parabolas
 
-VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
+VALUES = {"contact.planted_height": 0.11, "pelvis.half_life": 0.3, "leg.soften": 0.95}
 TRUTH = """
 preset = "record"
 faithful = true
 contact.planted_height = 0.10
-pelvis = { on_gain = 0.5, vertical_only = true }
+pelvis = { half_life = 0.5, vertical_only = true }
 probe.toe_ls = [0.0, -0.07, 0.2]
 noise.ankle = 0.01
 """
@@ -106,7 +106,7 @@ def fitted(experiment) -> Fit:
         at_bound=("", "", "high"),
         eigenvalues=np.array([0.1, 20.0]),
         weakest=("leg.soften",),
-        correlated=(("pelvis.on_gain", "leg.soften", -0.93),),
+        correlated=(("pelvis.half_life", "leg.soften", -0.93),),
         ridges=(),
         best_u=u,
         best_cost=99.75,
@@ -126,13 +126,13 @@ def line_of(text: str, name: str) -> str:
 
 
 def test_known_values_are_those_of_the_first_clip_that_has_any(experiment, tmp_path):
-    values = {"contact.planted_height": 0.10, "pelvis.on_gain": 0.5}
+    values = {"contact.planted_height": 0.10, "pelvis.half_life": 0.5}
     values |= {"probe.toe_ls": pytest.approx(0.13 / 3)}
     values |= {"probe.toe_ls[0]": 0.0, "probe.toe_ls[1]": -0.07, "probe.toe_ls[2]": 0.2}
     assert problems.load_known_values(experiment) == values
     assert problems.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
-    one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
-    assert (problems.load_known_values(one_leg) or {})["pelvis.on_gain[1]"] == 0.5
+    one_leg = replace(experiment, free={"pelvis.half_life[1]": {}})
+    assert (problems.load_known_values(one_leg) or {})["pelvis.half_life[1]"] == 0.5
     (tmp_path / "broken.toml").write_text("contact = [")
     broken = replace(experiment.clips[0], truth=tmp_path / "broken.toml")
     with pytest.raises(ValueError, match=r"broken\.toml: not TOML"):
@@ -146,10 +146,10 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert "Cost 900 before, 100 after: 8 steps" in text
     distance = goodness.size("ankle", fitted.distances.parts["fitted"]["fitted"]["ankle"])
     assert re.split(r"\s{2,}", line_of(text, "ankles  "))[1::3] == ["fitted", distance]
-    # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.
+    # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.002 to 0.5.
     planted = line_of(text, "contact.planted_height")
     assert "0.11 " in planted and "2.5 % of range" in planted and "0.1 to 0.12" in planted
-    assert "21.3 % of range" in line_of(text, "pelvis.on_gain")
+    assert "40.2 % of range" in line_of(text, "pelvis.half_life")
     soften = line_of(text, "leg.soften")
     assert "at least 0.85" in soften and "at its upper bound" in soften
     assert "unknown" in soften
@@ -158,13 +158,6 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     text = fit_report.fit_text(replace(fitted, known_values=None, experiment=whitened))
     assert "100 after (both with the noise estimated here)" in text
     assert "truth" not in text and "determined parameters within" not in text
-    # A gain is shown as half-life, s, and at 30 and 60 Hz.
-    gains = line_of(text.split("gain at 60 Hz")[1], "pelvis.on_gain")
-    name, half_life, _, gain, gain_at_60 = gains.split()
-    assert name == "pelvis.on_gain"
-    shown = [float(number) for number in (half_life, gain, gain_at_60)]
-    expected = [np.log(0.5) / np.log(0.7) / 30.0, 0.3, 1 - np.sqrt(0.7)]
-    np.testing.assert_allclose(shown, expected, rtol=1e-3)
 
 
 def test_what_the_fit_has_made_worse_is_the_first_sentence(fitted):
@@ -231,7 +224,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
     assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Not determined: `leg.soften`." in text
     assert fitted.verdict.sentence in text.split("## Opening")[0]
-    assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
+    assert "`pelvis.half_life` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | at least 0.85 | 0.85 to 1 | 0.100 |" in text
     nudges = playback.nudge_thresholds(fitted.problem, fitted.solution.u)
     down, up = nudges["contact.planted_height"]
@@ -305,7 +298,7 @@ def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(f
     tight = active({"pelvis.limit": 0.0})
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
-    assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
+    assert not {"lock.max_speed", "pelvis.half_life"} & set(tight)
     (activity,) = playback.measure_activity(fitted.ik, fitted.problem.data, fitted.results)
     (result,) = fitted.results
     locked = np.asarray(playback.stage_outputs(result).advanced.state.lock.locked)
@@ -387,7 +380,7 @@ def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path, un
     assert text.startswith(f"{of_fit}\n## Posterior\n")
     covered = "of 1 of 2 parameters; among those that the fit calls determined, of 1 of 2."
     assert f"contain the true values {covered}" in text
-    assert "| pelvis.on_gain | 1/tick |" in text
+    assert "| pelvis.half_life | s |" in text
     assert "(corner.png)" in text and "(chain.png)" in text
 
 
@@ -432,9 +425,9 @@ def test_parameters_of_which_chain_and_fit_disagree_are_named(fitted, tmp_path):
     values[..., 1] += 2.0
     values[..., 2] = 0.9  # never moves, and can be drawn
     text, numbers = write_posterior(tmp_path, fitted, replace(posterior, values=values))
-    assert "the 95 % interval of pelvis.on_gain" in text and "leaves out the fitted value" in text
+    assert "the 95 % interval of pelvis.half_life" in text and "leaves out the fitted value" in text
     reasons = {row["name"]: row["reason"] for row in numbers["disagreements"]}
-    assert reasons["pelvis.on_gain"] == "leaves out the fit"
+    assert reasons["pelvis.half_life"] == "leaves out the fit"
     for name in ("corner.png", "chain.png"):
         with Image.open(tmp_path / name) as picture:
             assert min(picture.size) > 400
@@ -573,7 +566,7 @@ def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp
     assert "a &lt;b&gt; &amp; c" in text and "Numbers are for an adult" in text
     files = ["uneven_walk.npz", "uneven_walk_base.npz", "uneven_walk.ply"]
     assert clips[1] == [*files, "1 s", "2 s"]
-    assert [row[0] for row in free[1:]] == ["pelvis.on_gain", "foot.max_pitch"]
+    assert [row[0] for row in free[1:]] == ["pelvis.half_life", "foot.max_pitch"]
     assert free[2][3] == "0.1 to 1.4"
     assert display.html("a < b") == "<pre>&#x27;a &lt; b&#x27;</pre>", "as is anything else"
 

@@ -39,8 +39,8 @@ FlatFoot: max_tilt rad 0.7853982 0 1.5
 PitchRollFoot: max_pitch rad 0.52 0 1.4; min_pitch rad -0.79 -1.4 0; max_roll rad 0.26 0 1;
   min_roll rad -0.52 -1 0
 SlopeLean: forward_rate 1 -0.3 -1 1; side_rate 1 -0.1 -1 1; forward_rate_slide 1 0.8 -1 1;
-  side_rate_slide 1 0.6 -1 1; gain 1/tick 0.19 0.01 0.95; gain_slide 1/tick 0.294 0.01 0.95;
-  slide_on_gain 1/tick 0.226 0.01 0.95; slide_off_gain 1/tick 0.135 0.01 0.95
+  side_rate_slide 1 0.6 -1 1; half_life s 0.1096 0.002 0.5; half_life_slide s 0.06637 0.002 0.5;
+  slide_on_half_life s 0.09019 0.002 0.5; slide_off_half_life s 0.1593 0.002 0.5
 SpineLean: uphill_rate 1 -0.65 -1 1; downhill_rate 1 -0.25 -1 1; side_rate 1 0 -1 1;
   forward_rate_slide 1 0 -1 1; side_rate_slide 1 0 -1 1; head_share 1 0.5 0 1;
   pelvis_rate 1 -0.25 -1 1; pelvis_side_rate 1 0 -1 1; spacing m 0.3 0.05 2
@@ -58,8 +58,8 @@ PlantLock: plant_weight 1 1 0 1; plant_speed 1/s inf 0.1 20; release_distance m 
   release_angle rad 3.141593 0.1 3.141593; release_time s 0.3 0.05 1
 CapsulePelvis: half_height m 0.9 0.3 2
 LegLengthPelvis: min_length m 0.5 0 1; max_length m 0.88 0.2 1.5; speed 1/s 10 0.5 30
-LowestPelvis: limit m 0.3 0 0.6; on_gain 1/tick 0.225 0.01 0.95; off_gain 1/tick 0.116 0.01 0.95;
-  min_extension 1 0 0 0.8
+LowestPelvis: limit m 0.3 0 0.6; half_life s 0.09065 0.002 0.5;
+  airborne_half_life s 0.1874 0.002 0.5; min_extension 1 0 0 0.8
 ReachPelvis: highest_share 1 0.75 0 1.2; extension 1 0.958 0.85 1; softness m 0.025 0.002 0.1;
   shift 1 0.15 0 1; landing_time s 0 0.02 0.3; rise_speed m/s 0.3 0.05 3
 ReachPelvis SlopeTarget: rise_half_life s 0 0.002 0.5; fall_half_life s 0 0.002 0.5
@@ -107,13 +107,12 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
   OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade
 ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no; SoleTarget; NoLean;
-  NoLock; NoSeparation; LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes;
-  PoleLeg;
-  AimFoot; SpeedFade
+  NoLock; NoSeparation; LowestPelvis limit=inf half_life=0 airborne_half_life=0;
+  DirectEffector if_found=yes; PoleLeg; AimFoot; SpeedFade
 ozz!: StandingContact; GroundRoot half_life=0 cross_gaps=no; StrideWarp;
   FootProbe limited=no ray_down=inf use_toe=no; SoleTarget; NoLean; NoLock; NoSeparation;
-  LowestPelvis limit=inf on_gain=1 off_gain=1; DirectEffector if_found=yes; PoleLeg; AimFoot;
-  NoFade
+  LowestPelvis limit=inf half_life=0 airborne_half_life=0;
+  DirectEffector if_found=yes; PoleLeg; AimFoot; NoFade
 unreal: StandingContact idle_speed=0.1; GroundRoot; StrideWarp; RootProbe; RootTarget; NoLean;
   NoLock; NoSeparation; CapsulePelvis; BodyEffector latch=yes;
   TwoBone max_knee_angle=3.14159 min_knee_angle=0 soften=1; KeepFoot; SpeedFade

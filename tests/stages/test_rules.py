@@ -89,7 +89,7 @@ def test_a_rule_that_has_been_merged_into_another_one_keeps_its_name_in_files(
         ("rules = { pelvis = 'Low' }", "pelvis has no rule 'Low'; it has .*'LowestPelvis',"),
         ("rules = { pelvis = 'TwoBone' }", "pelvis has no rule 'TwoBone'"),
         ("rules = { pelvis = ['LowestPelvis'] }", r"pelvis has no rule \['LowestPelvis'\]"),
-        ("rules = { pelvis = 'CapsulePelvis' }\npelvis.on_gain = 0.1", "key 'pelvis.on_gain'"),
+        ("rules = { pelvis = 'CapsulePelvis' }\npelvis.half_life = 0.1", "key 'pelvis.half_life'"),
     ],
 )
 def test_a_rule_or_parameter_that_is_unknown_is_refused(tmp_path, text, message):

@@ -125,17 +125,21 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("lean.side_rate", (-0.3, 0.3), "- lean right", ASIDE),
         Case("lean.forward_rate_slide", (0, 0.8), "- lean forward", AHEAD, clip="sliding"),
         Case("lean.side_rate_slide", (0, 0.8), "- lean right", ASIDE, clip="sliding"),
-        WALKS("lean.gain", (0.05, 0.3), "- lean forward", RAMP_UP, LEANS),
-        Case("lean.gain_slide", (0.05, 0.3), "- lean forward", RAMP_UP, clip="slides forward"),
-        Case("lean.slide_on_gain", (0.05, 0.3), "- lean forward", AHEAD, clip="begins to slide"),
-        Case("lean.slide_off_gain", (0.05, 0.3), "+ lean forward", AHEAD, clip="ceases to slide"),
-        WALKS("lean.tick_hz", (30.0, 60.0), "- lean forward", RAMP_UP, LEANS),
+        WALKS("lean.half_life", (0.06, 0.4), "+ lean forward", RAMP_UP, LEANS),
+        Case("lean.half_life_slide", (0.06, 0.4), "+ lean forward", RAMP_UP, clip="slides forward"),
+        Case(
+            "lean.slide_on_half_life", (0.06, 0.4), "+ lean forward", AHEAD, clip="begins to slide"
+        ),
+        Case(
+            "lean.slide_off_half_life", (0.06, 0.4), "- lean forward", AHEAD, clip="ceases to slide"
+        ),
         WALKS("lean.spring", (False, True), "+ lean forward", LATE, LEANS),
         Case("lock.hold_ball", (False, True), "- ball slip", base=LOOSE | HEEL_UP, clip="walks"),
         Case("pelvis.limit", (0.1, 0.2), "- pelvis height", DEEP),
-        WALKS("pelvis.on_gain", (0.1, 0.3), "+ pelvis height", RAMP_UP, NO_LOCK),
-        Case("pelvis.off_gain", (0.05, 0.2), "+ pelvis height", BELOW, clip="lifts its feet"),
-        WALKS("pelvis.tick_hz", (30.0, 60.0), "+ pelvis height", RAMP_UP, NO_LOCK),
+        WALKS("pelvis.half_life", (0.06, 0.2), "- pelvis height", RAMP_UP, NO_LOCK),
+        Case(
+            "pelvis.airborne_half_life", (0.1, 0.4), "- pelvis height", BELOW, clip="lifts its feet"
+        ),
         Case("pelvis.vertical_only", (False, True), "- pelvis forward", tilted((0.3, 0, -0.2))),
         Case("pelvis.wait_to_rise", (False, True), "- pelvis height", RAMP_DOWN, clip="walks"),
         Case("pelvis.min_extension", (0.77, 0.8), "+ pelvis height", STEEP),

@@ -10,8 +10,8 @@ from support import cases, singular
 from support.cases import ALL, ANKLE_DEEP, DESCENT, FLAT, KINK, NONE, RAMP_UP, Case, tilted
 
 KEPT = {"root.enabled": False}
-SLOW = KEPT | {"pelvis.on_gain": 0.1}
-HALF_WEIGHT = {"leg.weight": 0.5}
+SLOW = KEPT | {"pelvis.half_life": 0.2}
+IN_PART = SLOW | {"leg.weight": 0.5}
 UNSTABLE = {"probe.stable_height": 0.0}
 STIFF = {"pelvis.enabled": False}
 BENT = {"leg.max_knee_angle": 2.2}
@@ -91,10 +91,9 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("target.max_slope", (0.3, 0.6), "+ target height", tilted((1.0, 0, 0))),
         Case("pelvis.enabled", (False, True), "- pelvis height", LOWERED, KEPT),
         Case("pelvis.limit", (0.1, 0.2), "- pelvis height", LOWER, KEPT),
-        WALKS("pelvis.on_gain", (0.1, 0.3), "+ pelvis height", RAMP_UP, KEPT),
-        WALKS("pelvis.tick_hz", (30.0, 60.0), "+ pelvis height", RAMP_UP, SLOW),
+        WALKS("pelvis.half_life", (0.06, 0.2), "- pelvis height", RAMP_UP, KEPT),
         # Counts as far as no foot stands.
-        WALKS("pelvis.off_gain", (0.05, 0.2), "+ pelvis height", RAMP_UP, SLOW | HALF_WEIGHT),
+        WALKS("pelvis.airborne_half_life", (0.1, 0.4), "- pelvis height", RAMP_UP, IN_PART),
         *legs(LOWERED, **KEPT),
         Case("leg.enabled", (False, True), "- miss", RAISED, KEPT | STIFF),
         Case("leg.to_hint", (False, True), "+ knee left", FLAT, {"leg.hint_offset": ASIDE}),

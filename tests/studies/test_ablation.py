@@ -45,7 +45,7 @@ class Search:
         self.calls.append((problem, experiment))
         names = problem.space.names
         frames = sum(int(scene.reference.observed.sum()) for scene in problem.data)
-        best = {name: 0.3 if name != "pelvis.on_gain" else frames / 1000 for name in names}
+        best = {name: 0.3 if name != "pelvis.half_life" else frames / 1000 for name in names}
         u = np.asarray(problem.space.pack(best))
         values = np.asarray(problem.space.values(jnp.asarray(u)))
         return problem, Solution(
@@ -82,7 +82,7 @@ free = { pelvis.lowest_share = { low = 0.1 } }
 """
     experiment = load(tmp_path, rest)
     variant = ablation.without(experiment, experiment.without[0])
-    assert "pelvis.on_gain" not in variant.free  # it belongs to the rule that is replaced
+    assert "pelvis.half_life" not in variant.free  # it belongs to the rule that is replaced
     assert variant.free["pelvis.lowest_share"] == {"low": 0.1}
     with pytest.raises(ValueError, match="reach: free: unknown key 'pelvis.lowest_shore'"):
         load(tmp_path, rest.replace("lowest_share", "lowest_shore"))
@@ -90,7 +90,7 @@ free = { pelvis.lowest_share = { low = 0.1 } }
 
 def test_an_ablation_drops_parameters_that_its_rules_do_not_have_but_no_mistakes(tmp_path):
     rest = "[parameters]\npelvis.limit = 0.3\nlock.enabled = false\n"
-    free = 'pelvis.on_gain = {}\nfoot."max_pitch[0]" = {}\npelvis.of_gain = {}\n'
+    free = 'pelvis.half_life = {}\nfoot."max_pitch[0]" = {}\npelvis.of_gain = {}\n'
     experiment = load(tmp_path, rest, free=free)
     variant = ablation.without(
         experiment, Ablation("p", {"pelvis": "CapsulePelvis"}, {"pelvis.speed": 4.0})
@@ -100,7 +100,7 @@ def test_an_ablation_drops_parameters_that_its_rules_do_not_have_but_no_mistakes
     assert set(variant.free) == {"foot.max_pitch[0]", "pelvis.of_gain"}
     variant = ablation.without(experiment, Ablation("f", {}, {"foot.max_pitch": 0.2}))
     assert variant.parameters["foot.max_pitch"] == 0.2 and variant.rules == {}
-    assert set(variant.free) == {"pelvis.on_gain", "pelvis.of_gain"}
+    assert set(variant.free) == {"pelvis.half_life", "pelvis.of_gain"}
 
 
 # Splits
@@ -151,7 +151,7 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     names = [(row.variant, row.part) for row in rows]
     assert names == [(name, part) for name in (ALL, PITCH, BOTH) for part in (1, 2, 0)]
     assert [list(row.values) for row in rows[::3]] == [
-        ["pelvis.on_gain", "foot.max_pitch"], ["pelvis.on_gain"], []
+        ["pelvis.half_life", "foot.max_pitch"], ["pelvis.half_life"], []
     ]  # fmt: skip
     frames = [len(problem.data[0].frames.dt) for problem, _ in search.calls]
     assert frames == [91] * 6, "at the rate of the fit; no fit where nothing is free"
@@ -171,7 +171,7 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     problem, variant = search.calls[3]
     assert float(parameter_tree.get(problem.space.system, "foot.max_pitch")) == 0.2
     assert float(problem.data[0].sigmas.ankle) == 0.05
-    assert variant.free == {"pelvis.on_gain": {}}
+    assert variant.free == {"pelvis.half_life": {}}
     assert {variant.noise for _, variant in search.calls} == {NoiseOptions("estimated")}
 
 
@@ -244,7 +244,7 @@ SEARCH: SearchRecord = {
 def row(variant: str, part: int, **figures: float) -> Row:
     joints = dict.fromkeys(("pelvis", "knee"), figures.get("ankle", 0.02))
     all_figures = dict.fromkeys(ACCURACY, 0.02) | joints | figures
-    values = {"pelvis.on_gain": 0.3} | ({} if variant == PITCH else {"foot.max_pitch": 0.4})
+    values = {"pelvis.half_life": 0.3} | ({} if variant == PITCH else {"foot.max_pitch": 0.4})
     return Row(
         "key", variant, part, Accuracy(**all_figures), values, {**SEARCH, "converged": part != 2}
     )

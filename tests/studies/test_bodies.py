@@ -136,9 +136,9 @@ def test_an_experiment_is_for_the_body_of_its_clip_unless_it_says_adult(tmp_path
     clips = f'[[clips]]\n{files}terrain = "floor.ply"\nroot = "animation"\n'
 
     def limits(top: str) -> tuple[float, float]:
-        path = write(tmp_path, top=top, clips=clips, free="pelvis.limit = {}\nlean.gain = {}")
+        path = write(tmp_path, top=top, clips=clips, free="pelvis.limit = {}\nlean.half_life = {}")
         space = make_problem(load_experiment(path)).space
-        assert space.parameters[1].high == 0.95
+        assert space.parameters[1].high == 0.5
         return space.parameters[0].high, float(parameter_tree.get(space.system, "pelvis.limit"))
 
     assert limits("") == pytest.approx((1.5, 0.75), rel=0.01)

@@ -37,7 +37,7 @@ from support.problems import compilations
 from support.small_studies import SAMPLE, kept, write_calibration
 from support.watching import listening
 
-RANKED = ["pelvis.on_gain", "foot.max_pitch", "log-probability"]
+RANKED = ["pelvis.half_life", "foot.max_pitch", "log-probability"]
 COUNT = 5  # of the replicates that all tests share
 
 
@@ -148,7 +148,7 @@ def test_only_the_intervals_of_thresholds_may_cover_more_than_they_promise(made)
     rows = [{**row, "interval": [row["low"], row["high"]]} for row in fitted["parameters"]]
     always: Any = {**fitted, "parameters": [{**rows[0], "kind": "threshold"}, rows[1]]}
     covered = assess(Calibration([always] * 400, [])).fit_coverage_of
-    assert covered["pelvis.on_gain"].inside and not covered["foot.max_pitch"].inside
+    assert covered["pelvis.half_life"].inside and not covered["foot.max_pitch"].inside
 
 
 def test_recovery_counts_determined_parameters_within_5_percent_of_their_range(made):
@@ -261,7 +261,7 @@ def test_the_folder_of_another_calibration_or_an_unknown_one_is_refused(
         ("fps = 20.0", SAMPLE, "in: problem; name"),
         ("", SAMPLE.replace("120", "130"), "in: sample; name"),
         ("", SAMPLE + "[fit]\nstarts = 3\n", "in: fit; name"),
-        ("", SAMPLE + "[start]\npelvis.on_gain = 0.5\n", "in: start; name"),
+        ("", SAMPLE + "[start]\npelvis.half_life = 0.5\n", "in: start; name"),
     ):
         with pytest.raises(ValueError, match=words):
             calibrate(write_calibration(tmp_path, top, rest), made.folder, 1)
@@ -300,7 +300,7 @@ def test_the_folder_has_a_report(finished):
     numbers = json.loads((out / "calibration.json").read_text())
     judged = {"replicates", "level", "inside", "outside", "fit_coverage", "ranks"}
     assert judged <= numbers.keys() and numbers["experiment"] == "hill"
-    assert numbers["inside"] is True and len(numbers["ranks"]["pelvis.on_gain"]["ranks"]) == COUNT
+    assert numbers["inside"] is True and len(numbers["ranks"]["pelvis.half_life"]["ranks"]) == COUNT
     assert set(numbers["chain_coverage"]) == {"0.5", "0.8", "0.95"}
 
 
@@ -319,11 +319,11 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
 
 def test_the_picture_marks_ranks_that_leave_their_band(finished):
     ranks = finished.assessment.ranks
-    wrong = dataclasses.replace(ranks["pelvis.on_gain"], ranks=np.zeros(40, int))
+    wrong = dataclasses.replace(ranks["pelvis.half_life"], ranks=np.zeros(40, int))
     figure = calibration.ranks({**ranks, "foot.max_pitch": wrong}, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:6] == [
-        "pelvis.on_gain", "", "foot.max_pitch", "outside its band", "log-probability", ""
+        "pelvis.half_life", "", "foot.max_pitch", "outside its band", "log-probability", ""
     ]  # fmt: skip
 
 

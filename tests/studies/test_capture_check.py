@@ -149,7 +149,7 @@ def test_what_a_preset_does_to_flat_clips_is_said_and_what_stops_it_is_free(
     assert "under all stances is flat" in text and "ozz as it comes, for this body" in text
     assert "ozz as it comes does not leave these feet alone, as it must on flat ground" in text
     free = load_experiment(draft / "experiment.toml").free
-    assert {"pelvis.on_gain", "leg.weight"} <= set(free) and len(free) <= 5
+    assert {"pelvis.half_life", "leg.weight"} <= set(free) and len(free) <= 5
 
 
 @pytest.mark.slow

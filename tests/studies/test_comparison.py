@@ -239,7 +239,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
 
 
 def test_poses_that_are_not_finite_name_their_system_and_are_not_written(folder, tmp_path, capsys):
-    (tmp_path / "mad.toml").write_text("pelvis.tick_hz = -inf\nleg.soften = inf\n")
+    (tmp_path / "mad.toml").write_text("lean.forward_rate = inf\n")
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", tmp_path / "out"]
     line = refusal([*words, "--parameters", tmp_path / "mad.toml"], tmp_path, capsys)
     assert line.startswith("jaxik compare: mad: these parameters give poses that are not finite")

@@ -165,14 +165,14 @@ def candidates(tmp_path, monkeypatch):
     limit = parameter_tree.get(problem.space.system, "pelvis.limit")
 
     def residuals(ik, scenes):
-        hidden = ik.lean.gain_slide * (ik.pelvis.limit - limit)
+        hidden = ik.lean.half_life_slide * (ik.pelvis.limit - limit)
         return jnp.append(quick.residuals_of_scenes(ik, scenes), 100.0 * hidden)
 
     def residuals_of_batch(space, scenes, candidates):
         return jax.vmap(lambda u: residuals(space.unpack(u), scenes))(candidates)
 
     monkeypatch.setattr(sensitivity, "_residuals_of_batch", residuals_of_batch)
-    names = [*quick.TARGETS, "lean.gain_slide", "probe.max_slope"]
+    names = [*quick.TARGETS, "lean.half_life_slide", "probe.max_slope"]
     return problem.space.system, dict.fromkeys(names, {}), problem.data
 
 

@@ -136,7 +136,7 @@ def test_each_fit_is_a_run_and_a_row(finished):
         assert "fit" in row and {**summary, "history": []} == row["fit"]
     present = read(finished.folder / many_fits.CSV)
     assert [row["run"] for row in present] == [row["run"] for row in finished.rows]
-    assert float(present[0]["pelvis.on_gain"]) == pytest.approx(0.3, abs=0.02)
+    assert float(present[0]["pelvis.half_life"]) == pytest.approx(0.3, abs=0.02)
     parquet = pyarrow.parquet.read_table(finished.folder / many_fits.PARQUET).to_pylist()
     assert [row["cost"] for row in parquet] == [row["cost"] for row in cells(finished)]
     files = {path.name for path in finished.folder.iterdir()}
@@ -229,7 +229,7 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
 
 # Many systems on many clips: the numbers of each, in chunks, by one program
 
-GAINS = np.linspace(0.05, 0.9, 5)
+HALF_LIVES = np.linspace(0.05, 0.9, 5)
 COST = "cost"
 
 
@@ -255,12 +255,12 @@ def run_alone(ik: jaxik.FootIK, scene: Scene) -> Playback:
 
 @pytest.mark.slow
 def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
-    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    batch = fitting.vary(ik, {"pelvis.half_life": HALF_LIVES})
     with jax.enable_x64(False):  # as it is for users
         numbers = fitting.evaluate_many(batch, problem.data, chunk=2)
     assert {values.shape for values in numbers.values()} == {(5, 3)}
     scene = unscaled(problem.data[1])
-    played = run_alone(parameter_tree.replace(ik, {"pelvis.on_gain": GAINS[3]}), scene)
+    played = run_alone(parameter_tree.replace(ik, {"pelvis.half_life": HALF_LIVES[3]}), scene)
     cost = 0.5 * sum(np.sum(np.square(of_kind)) for of_kind in played.residuals.values())
     assert numbers[COST][3, 1] == pytest.approx(cost, rel=1e-10)
     expected = np.sqrt(np.mean(played.errors["pelvis"][played.seen] ** 2, axis=0).sum())
@@ -280,7 +280,7 @@ def test_data_of_32_bits_are_evaluated_by_c_code_alike(problem, ik, systems, cli
     monkeypatch.setattr(evaluation._Calls, "_by_kernel", by_kernel)
     flat = [dataclasses.replace(s, terrain=plane(normal=(0.1, 1.0, 0.0))) for s in problem.data]
     data = with_floats(flat[:clips], jnp.float32)
-    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS[:systems]})
+    batch = fitting.vary(ik, {"pelvis.half_life": HALF_LIVES[:systems]})
     fitting.evaluate_many(batch, data, chunk=3)
     assert not calls  # too little for code to pay
     monkeypatch.setattr(evaluation, "WORTH", 0)
@@ -308,18 +308,18 @@ def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):
 
 def test_no_chunk_and_no_second_call_compiles_anew(problem, ik):
     programs = evaluation._along._cache_size  # pyright: ignore[reportAttributeAccessIssue]
-    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    batch = fitting.vary(ik, {"pelvis.half_life": HALF_LIVES})
     fitting.evaluate_many(batch, problem.data, chunk=2)
     before = programs()
     assert before >= 1
-    more = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, 7)})
+    more = fitting.vary(ik, {"pelvis.half_life": np.linspace(0.1, 0.8, 7)})
     numbers = fitting.evaluate_many(more, problem.data, chunk=2)
     assert programs() == before and numbers[COST].shape == (7, 3)
 
 
 def calls_of(ik, scenes, systems: int, chunk: int | None, memory: float) -> evaluation._Calls:
     """What evaluates so many systems on clips of one length."""
-    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
+    batch = fitting.vary(ik, {"pelvis.half_life": np.linspace(0.1, 0.8, systems)})
     mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
     (stack,) = evaluation.shared_world.stack(scenes)
     arrays, measure = jax.tree.map(np.asarray, batch), evaluation.errors_and_cost
@@ -349,7 +349,7 @@ def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, systems, clips)
 
 
 def test_what_cannot_be_evaluated_is_refused(problem, ik):
-    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    batch = fitting.vary(ik, {"pelvis.half_life": HALF_LIVES})
     for systems, clips, chunk, message in (
         (ik, problem.data, None, "an array of the systems has no axis for them"),
         (batch, (), None, "no clips; wanted one or more"),
@@ -358,8 +358,11 @@ def test_what_cannot_be_evaluated_is_refused(problem, ik):
         with pytest.raises(ValueError, match=message):
             fitting.evaluate_many(systems, clips, chunk=chunk)
     for values, message in (
-        ({"pelvis.on_gain": GAINS, "pelvis.limit": GAINS[:3]}, "wanted the same number of each"),
-        ({"pelvis.wings": GAINS}, "no parameter named 'pelvis.wings'"),
+        (
+            {"pelvis.half_life": HALF_LIVES, "pelvis.limit": HALF_LIVES[:3]},
+            "wanted the same number of each",
+        ),
+        ({"pelvis.wings": HALF_LIVES}, "no parameter named 'pelvis.wings'"),
     ):
         with pytest.raises(ValueError, match=message):
             fitting.vary(ik, values)

@@ -113,7 +113,7 @@ def test_a_subject_is_crossed_with_others_and_with_its_own_other_clips():
 
 
 def test_subjects_are_measured_with_parameters_that_others_gave(fitted):
-    own = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
+    own = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
     gains = np.array(MEASURED)[:, 0]
     expected = {  # the clips are raised by the gain, and captured near to the animation
         ("ann", population.NOTHING): [own, own],
@@ -218,11 +218,11 @@ def test_the_folder_has_a_report_and_parameters(made):
     assert "uneven_walk from 1 s: cost" in printed and f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()
     assert summary.startswith("# walks\n\nClips fitted alone, pooled and as a population: **Conv")
-    assert "- `pelvis.on_gain` differs " in summary and "from 3 clips only." in summary
+    assert "- `pelvis.half_life` differs " in summary and "from 3 clips only." in summary
     assert "A clip that is left out is predicted to" in summary
     assert "(population.png)" in summary and (out / "population.png").stat().st_size > 10_000
     page = Page(out / pages.PAGE)
-    assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
+    assert "too few to say much of spreads: pelvis.half_life differs between them." in page.text
     assert "All 7 searches and the fit of the population converged." in page.text
     assert "ann other subjects 30." in page.text
     assert re.search(r"all clips \d+\.\d+ 2 of 2 ", page.text)
@@ -231,14 +231,14 @@ def test_the_folder_has_a_report_and_parameters(made):
     assert numbers["crossed"][2]["fitted_on"] == population.OTHERS
     assert numbers["crossed"][2]["pelvis"] == pytest.approx(0.3, abs=0.01)
     assert numbers["converged"] and numbers["subjects"] == list(SUBJECTS)
-    assert [row["name"] for row in numbers["parameters"]] == ["pelvis.on_gain", "foot.max_pitch"]
-    assert load_experiment(out / "experiment.toml").hierarchy.per_clip == ("pelvis.on_gain",)
+    assert [row["name"] for row in numbers["parameters"]] == ["pelvis.half_life", "foot.max_pitch"]
+    assert load_experiment(out / "experiment.toml").hierarchy.per_clip == ("pelvis.half_life",)
     for name, expected in (
         ("parameters.toml", numbers["parameters"][0]["centre"]["value"]),
         ("clips/uneven_walk from 1 s.toml", numbers["parameters"][0]["clips"][1]["value"]),
     ):
         ik, preset = parameter_files.load_system(out / name)
-        assert float(parameter_tree.get(ik, "pelvis.on_gain")) == pytest.approx(expected)
+        assert float(parameter_tree.get(ik, "pelvis.half_life")) == pytest.approx(expected)
         assert preset.name == "record"
 
 
@@ -257,7 +257,7 @@ def test_what_has_not_converged_is_said_and_ends_with_status_3(
 def test_the_summary_says_whether_clips_differ_as_far_as_that_is_known(fitted):
     gain, pitch = fitted.parameters
     for spread, text in (
-        (gain["spread"], "`pelvis.on_gain` differs between clips: spread "),
+        (gain["spread"], "`pelvis.half_life` differs between clips: spread "),
         ({"value": 0.2, "interval": [0.0, 1.5]}, "spread 0.2, at most 1.5, from 3 clips only."),
         (
             {"value": 0.0, "interval": [0.0, 0.7]},
@@ -275,7 +275,7 @@ def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
         "uneven_walk from 0 s (ann)", "uneven_walk from 1 s (ann)", "uneven_walk from 2 s (ben)",
         "pooled", "population", "spread, of u",
     ]  # fmt: skip
-    assert table[1][0] == "`pelvis.on_gain`, 1/tick, per clip" and table[7][1] == "95 % of clips"
+    assert table[1][0] == "`pelvis.half_life`, s, per clip" and table[7][1] == "95 % of clips"
     assert table[8][0] == "`foot.max_pitch`, rad, shared" and len(table) == 13
     assert table[8][3] == "" != table[12][3]
     errors = population.error_table(fitted)
@@ -284,4 +284,4 @@ def test_tables_and_picture_have_each_clip_pooled_and_the_population(fitted):
     assert errors[-1][1] == f"{100 * np.sqrt(np.mean(squares)):.2f}"
     figure = population.overview(fitted, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
-    assert titles == ["pelvis.on_gain", "Error"]
+    assert titles == ["pelvis.half_life", "Error"]

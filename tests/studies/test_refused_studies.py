@@ -93,7 +93,7 @@ def test_what_does_not_vary_smoothly_makes_no_population(tmp_path, capsys, monke
     threshold = "contact.planted_height"
     for rest, free, message in (
         ("", FREE, "nothing varies between the clips; name free parameters in the table [hier"),
-        (VARYING.replace("pelvis.on_gain", threshold), f"{threshold} = {{}}", "is a threshold: "),
+        (VARYING.replace("pelvis.half_life", threshold), f"{threshold} = {{}}", "is a threshold: "),
     ):
         path = small_studies.write_population(tmp_path, rest, free=free)
         words = ["population", path, "-o", tmp_path / "out"]

@@ -25,7 +25,6 @@ from fitting.inference.noise import NoiseOptions
 from fitting.inference.sample.chain import Chain, Identity
 from fitting.inference.sample.posterior import digest
 from fitting.motion.goodness import CLOSE, Distances, Kinds, Motion
-from fitting.problem.space import gain_readings
 from fitting.runtime.claimed_folder import LOCK, claimed
 from fitting.studies.fit import assess, run_folder
 from fitting.studies.fit.assess import search
@@ -33,6 +32,7 @@ from fitting.studies.fit.fit import MAX_START_SD, THRESHOLD_SD, Fit
 from fitting.studies.sample.sample import walker_start
 from fuzz import stored_files
 from jaxik.maths import parameter_tree
+from jaxik.record.parameters import half_life_of_gain
 from support import quick, small_studies
 from support.commands import refusal
 from support.experiments import ROOT, write
@@ -184,13 +184,6 @@ def test_walkers_start_near_thresholds_and_neither_too_near_nor_too_far(fitted):
     np.testing.assert_array_equal(wide.start_sd, [THRESHOLD_SD, MAX_START_SD])
 
 
-def test_a_gain_has_a_half_life_and_gains_at_other_rates():
-    readings = gain_readings(0.3)
-    assert readings["gain_at_30_hz"] == pytest.approx(0.3)
-    assert (1 - readings["gain_at_60_hz"]) ** 2 == pytest.approx(0.7)
-    assert 0.7 ** (30 * readings["half_life"]) == pytest.approx(0.5)
-
-
 @pytest.fixture
 def solved(tmp_path, monkeypatch):
     """An experiment, its problem and solution, and how well the data determine it."""
@@ -335,7 +328,9 @@ def test_a_released_fit_is_read_and_applied_but_its_chain_is_refused(
     path.write_text(path.read_text().replace("{data}", str(DATA)))
     experiment, summary = run_folder.load_fit(run)
     values = {row["name"]: row["value"] for row in summary["parameters"]}
-    assert values == pytest.approx(quick.TARGETS, abs=0.001)
+    # It was a gain of 0.3 per tick of 30 Hz.
+    targets = quick.TARGETS | {"pelvis.half_life": half_life_of_gain(0.3, 30.0)}
+    assert values == pytest.approx(targets, abs=0.001)
     assert (experiment.loss, experiment.holdout) == ("squares", 0.0), "as it was fitted"
     assert experiment.noise == NoiseOptions(correlation="given")
     space = problems.make_problem(experiment).space
@@ -428,7 +423,7 @@ def test_a_toml_file_of_a_newer_format_or_another_system_is_refused(run, capsys)
         assert f"{name}: its format is 9; this release reads formats up to 1" in line
     (run / run_folder.PARAMETERS).write_text('preset = "record"\n')
     line = applying_refused(run, capsys)
-    assert "no foot.max_pitch, pelvis.on_gain; `jaxik fit` makes a run" in line
+    assert "no foot.max_pitch, pelvis.half_life; `jaxik fit` makes a run" in line
 
 
 def test_a_run_that_another_process_samples_is_left_alone(run, capsys):
@@ -522,7 +517,7 @@ CHANGED = [
     ("fits/0000.json", {"number": 3}, "it is of replicate 3"),
     ("fits/0000.json", {"truth": [0.1, 0.2]}, "its lists have different lengths"),
     ("fits/0000.json", {"parameters": []}, "parameters has []; wanted"),
-    ("chains/0000.json", {"ranks": {"lean.gain": 3}}, "ranks has "),
+    ("chains/0000.json", {"ranks": {"lean.half_life": 3}}, "ranks has "),
     ("chains/0000.json", {"intervals": {}}, "intervals has []; wanted"),
 ]
 

@@ -38,7 +38,7 @@ from support.experiments import ROOT
 from support.pages import save_pixel
 
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
-TRUTH = {"pelvis.on_gain": 0.45, "pelvis.limit": 0.17}
+TRUTH = {"pelvis.half_life": 0.45, "pelvis.limit": 0.17}
 SOFT = {"leg.soften": 0.96}  # of the source, but not free, so that a difference remains
 STILL = {"leg.weight": 0.0, "lock.enabled": False, "pelvis.limit": 0.0}
 QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")
@@ -143,10 +143,10 @@ def test_the_summary_shows_both_systems_side_by_side(run):
     assert text.startswith("# mine to record\n")
     assert "## How much of `mine` `record` reproduces" in text and "difference.png" in text
     table = text.partition("## Parameters of both systems")[2].splitlines()
-    (line,) = (line for line in table if line.startswith("| `pelvis.on_gain`"))
-    assert line.startswith("| `pelvis.on_gain` | 1/tick | 0.45 | 0.") and line.endswith("fitted |")
+    (line,) = (line for line in table if line.startswith("| `pelvis.half_life`"))
+    assert line.startswith("| `pelvis.half_life` | s | 0.45 | 0.") and line.endswith("fitted |")
     unchanged = text.partition("kept their values, as requested:")[2].splitlines()[0]
-    assert "`lean.gain_slide`" in unchanged and (run / "difference.png").is_file()
+    assert "`lean.half_life_slide`" in unchanged and (run / "difference.png").is_file()
     assert "of 2 determined parameters within 5 % of their range" in text
     assert parameter_files.load_system(run / "record.toml")[1] == systems.DEFAULT_PRESET
 
@@ -201,7 +201,7 @@ def test_only_parameters_that_move_the_clip_are_free_by_default(run):
     named = sensitivity.all_parameters(presets.record())
     assert {"probe.toe_ls[0]", "probe.toe_ls[2]", "pelvis.limit"} <= set(named)
     assert named["lock.max_speed"] == {"high": 12.0}  # it is infinite: that must be within reach
-    tried = ("pelvis.limit", "lean.gain_slide", "leg.max_knee_angle")
+    tried = ("pelvis.limit", "lean.half_life_slide", "leg.max_knee_angle")
     few = {name: named[name] for name in tried}
     ik = presets.record(faithful=True)  # compiles sooner
     moving = sensitivity.measure_sensitivity(ik, few, (scene,))

@@ -12,7 +12,7 @@ terrain = "{ROOT}/data/terrains/uneven_walk.ply"
 """
 SECOND = "start = 1.0\nend = 2.0\n"
 FREE = """
-pelvis.on_gain = {}
+pelvis.half_life = {}
 foot.max_pitch = { low = 0.1 }
 """
 

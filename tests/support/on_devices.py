@@ -47,7 +47,7 @@ def invented_errors(scene, ik):
     import jax.numpy as jnp
 
     def step(place, target):
-        place = place + ik.pelvis.on_gain * (target - place)
+        place = place + ik.pelvis.half_life * (target - place)
         return place, place
 
     reference, zero = scene.reference, jnp.zeros(3, scene.frames.dt.dtype)
@@ -89,7 +89,7 @@ def evaluations(*kinds: str) -> dict[str, np.ndarray]:
     found = {}
     for kind in kinds or ("systems", "clips"):
         gains = np.linspace(0.05, 0.9, SYSTEMS) if kind == "systems" else [0.2]
-        batch = fitting.vary(ik, {"pelvis.on_gain": gains})
+        batch = fitting.vary(ik, {"pelvis.half_life": gains})
         chunk = CHUNK if kind == "systems" else 2
         values = fitting.evaluate_many(batch, problem.data, chunk=chunk)
         found |= {f"{kind} {name}": value for name, value in values.items()}

@@ -5,13 +5,13 @@ from collections.abc import Iterable
 import equinox as eqx
 import jax.numpy as jnp
 
-TARGETS = {"pelvis.on_gain": 0.3, "foot.max_pitch": 0.4}
+TARGETS = {"pelvis.half_life": 0.3, "foot.max_pitch": 0.4}
 SIGMA = 0.02  # of what stands in a reference
 
 
 def residuals_of_scenes(ik, scenes):
     """Distance of two parameters from known values, in hundredths."""
-    residuals = [ik.pelvis.on_gain - 0.3, ik.foot.max_pitch - 0.4]
+    residuals = [ik.pelvis.half_life - 0.3, ik.foot.max_pitch - 0.4]
     return jnp.stack(residuals) / jnp.asarray(0.01, ik.leg.soften.dtype)
 
 
@@ -27,7 +27,7 @@ def residuals_of_references(ik, scenes):
 
 def values_of(ik):
     """The two parameters."""
-    return jnp.stack([ik.pelvis.on_gain, ik.foot.max_pitch])
+    return jnp.stack([ik.pelvis.half_life, ik.foot.max_pitch])
 
 
 def with_measured(problem, measured: Iterable):

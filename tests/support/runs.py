@@ -21,7 +21,7 @@ from .experiments import CLIP, ROOT, write
 from .profiles import parabolas
 
 LIMITS = {"leg.max_knee_angle": 0.5, "pelvis.limit": 0.0}  # fractions of the frames
-NAMES = ("pelvis.on_gain", "foot.max_pitch")
+NAMES = ("pelvis.half_life", "foot.max_pitch")
 
 
 def invented_fit(folder: Path, more: str = "", clips: str = CLIP) -> Fit:
@@ -48,7 +48,7 @@ def invented_fit(folder: Path, more: str = "", clips: str = CLIP) -> Fit:
     identifiability = Identifiability(
         names=NAMES,
         contraction=np.array([0.9, 0.2]),
-        profiles=parabolas(problem.space.parameters, [(0.1, 0.5), (0.2, 0.9)]),
+        profiles=parabolas(problem.space.parameters, [(0.1, 0.4), (0.2, 0.9)]),
         sd=np.array([0.01, np.nan]),
         at_bound=("", "high"),
         eigenvalues=np.array([0.1, 20.0]),

@@ -22,7 +22,7 @@ HALF_SECOND = CLIP + "start = 1.0\nend = 1.5\n"
 TWO_HALF_SECONDS = f"{HALF_SECOND}{CLIP}start = 2.0\nend = 2.5\n"
 ONE_START = "[fit]\nstarts = 1\n[fit.search]\nagreeing_starts = 1\n"
 SIX_SECONDS = CLIP + "end = 6.0\n"
-FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
+FREE = "pelvis.half_life = {}\nfoot.max_pitch = { low = 0.1 }\n"
 GIVEN = '[noise]\ncorrelation = "given"\n'  # what the residuals of a pipeline say is not asked
 SQUARES = 'loss = "squares"\n'
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 15.0\nmax_steps = 120\n"
@@ -32,9 +32,9 @@ name = "pitch"
 parameters = { foot.max_pitch = 0.2 }
 [[without]]
 name = "both"
-parameters = { foot.max_pitch = 0.2, pelvis.on_gain = 0.6 }
+parameters = { foot.max_pitch = 0.2, pelvis.half_life = 0.6 }
 """
-VARYING = GIVEN + '[hierarchy]\nper_clip = ["pelvis.on_gain"]\n'
+VARYING = GIVEN + '[hierarchy]\nper_clip = ["pelvis.half_life"]\n'
 SUBJECTS = ("ann", "ann", "ben")  # of the clips of a population
 MEASURED = ((0.2, 0.41), (0.5, 0.39), (0.3, 0.4))  # in them, in the order of FREE
 
@@ -55,7 +55,7 @@ def write_ablation(folder: Path, **parts: str) -> Path:
 def lift(animation, ik):
     """A result that needs no pipeline: everything is raised by the value of a gain, m."""
     base = animation.clip
-    up = [0.0, float(parameter_tree.get(ik, "pelvis.on_gain")), 0.0]
+    up = [0.0, float(parameter_tree.get(ik, "pelvis.half_life")), 0.0]
     return None, base.with_motion(base.positions_ws + up, base.rotations_ws)
 
 

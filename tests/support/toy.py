@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from fitting.inference.optimise import search
 from fitting.inference.optimise.solution import Solution
 from fitting.problem.problem import Problem
-from jaxik.maths import parameter_tree, smoothing
+from jaxik.maths import smoothing
 from jaxik.maths.gate import HARD
 
 from .problems import parameter, problem_of
@@ -37,8 +37,7 @@ class Lock(eqx.Module):
 
 
 class Body(eqx.Module):
-    gain: Array = parameter(0.3, "1/tick", 0.02, 0.9, scale="gain")
-    tick_hz: Array = eqx.field(default=30.0, converter=parameter_tree.as_float_array)
+    half_life: Array = parameter(0.065, "s", 0.01, 1.2, scale="log")
     drop: Array = parameter(0.15, "m", 0.0, 0.4)
     rise: Array = parameter(0.05, "m", 0.0, 0.2)
 
@@ -74,7 +73,7 @@ TRUTH = {
     "lock.speed_off": 0.95,
     "lock.half_life": 0.04,
     "lock.release": 0.15,
-    "body.gain": 0.17,
+    "body.half_life": 0.124,
     "body.drop": 0.11,
     "body.rise": 0.03,
     "foot.share": 0.85,
@@ -101,9 +100,7 @@ def run(ik: Toy, data: Data) -> tuple[Array, Array, Array]:
         share = smoothing.fraction_of_half_life(half_life, dt)
         offset = smoothing.lerp(offset, locked * (anchor - pos), share)
         goal = HARD.clip(HARD.minimum(ground, band=0.01), -body.drop, body.rise, band=0.01)
-        pelvis = smoothing.lerp(
-            pelvis, goal, smoothing.fraction_of_gain(body.gain, dt, body.tick_hz)
-        )
+        pelvis = smoothing.lerp(pelvis, goal, smoothing.fraction_of_half_life(body.half_life, dt))
         tilt = HARD.clip(foot.share * slope, -foot.limit, foot.limit, band=0.03)
         pitch = smoothing.lerp(pitch, tilt, smoothing.fraction_of_half_life(foot.half_life, dt))
         return (pos, anchor, offset, locked, pelvis, pitch), (pos + offset, pelvis, pitch)

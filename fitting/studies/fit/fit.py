@@ -23,7 +23,7 @@ from fitting.motion.playback import Playback
 from fitting.problem.capture_system import is_of_capture, system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED, Reference, Scene
-from fitting.problem.space import Space, gain_readings
+from fitting.problem.space import Space
 from fitting.runtime import activity
 from fitting.runtime.declarations import number
 from fitting.runtime.display import Displayable, data_frame
@@ -209,10 +209,6 @@ class FittedParameter(TypedDict):
     """0 where only the prior is known, 1 where the clips decide."""
     at_bound: Literal["", "low", "high"]
     determined: bool
-    half_life: NotRequired[float]
-    """s, of a gain."""
-    gain_at_30_hz: NotRequired[float]
-    gain_at_60_hz: NotRequired[float]
 
 
 class SearchRecord(TypedDict):
@@ -497,7 +493,5 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "at_bound": known.at_bound[i],
             "determined": parameter.name in known.determined,
         }
-        if parameter.scale == "gain":
-            row |= gain_readings(row["value"])  # type: ignore[operator]
         rows.append(row)
     return rows

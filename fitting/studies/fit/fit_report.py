@@ -278,7 +278,6 @@ def _parameters(fitted: Fit) -> Section:
         "Parameters",
         [
             _ranges(fitted, "system", "Free parameters"),
-            Grid(fit_tables.gain_table(rows), "Gains and their half-lives"),
             Text(known, brief=True),
         ],
     )

@@ -75,16 +75,6 @@ def parameter_table(rows: Sequence[FittedParameter], truth: Truth) -> Table:
     return table
 
 
-def gain_table(rows: Sequence[FittedParameter]) -> Table:
-    """Gains: their half-lives, and the gains per tick that these mean at 30 and 60 Hz."""
-    table = [["gain", "half-life", "gain at 30 Hz", "gain at 60 Hz"]]
-    for row in rows:
-        if "half_life" in row and "gain_at_30_hz" in row and "gain_at_60_hz" in row:
-            gains = [number(row["gain_at_30_hz"]), number(row["gain_at_60_hz"])]
-            table.append([row["name"], f"{number(row['half_life'])} s", *gains])
-    return table
-
-
 def recovered(rows: Sequence[FittedParameter], truth: Mapping[str, float]) -> str:
     """How many of the determined parameters are close to their true values."""
     known = [row for row in rows if row["determined"] and row["name"] in truth]

@@ -20,10 +20,11 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import jaxik
 from fitting.clips import save_clip
-from fitting.experiment import experiment_files, parameter_files
+from fitting.experiment import experiment_files, former, parameter_files
 from fitting.experiment.experiment import Experiment
 from fitting.experiment.systems import Preset
 from fitting.inference.noise import NoiseModel, NoiseOptions
@@ -36,7 +37,7 @@ from fitting.runtime.files import TEMPORARY, write_text
 from fitting.runtime.json_files import JsonFile, check_version
 from fitting.runtime.validation import flatten, read_toml
 
-from .fit import Fit, FitRecord
+from .fit import Fit, FitRecord, FittedParameter
 from .fit_motions import saved_clips
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
@@ -127,7 +128,9 @@ def load_record(run: Path) -> FitRecord:
         ValueError: the folder holds no finished fit.
     """
     _check_files(run, (FIT,))
-    return FIT_FILE.read(run / FIT, _check_numbers)
+    summary = FIT_FILE.read(run / FIT, _check_numbers)
+    rows = map(former.row_with_half_life, summary["parameters"])
+    return {**summary, "parameters": cast(list[FittedParameter], list(rows))}
 
 
 def load_fit(run: Path) -> tuple[Experiment, FitRecord]:
@@ -164,13 +167,15 @@ def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
 
 def _check_has_parameters(path: Path, summary: FitRecord) -> None:
     """Raises ValueError for the parameters of another fit."""
-    present = flatten(read_toml(path, "a parameter"), 2)
+    present = {
+        former.HALF_LIVES.get(name, name) for name in flatten(read_toml(path, "a parameter"), 2)
+    }
     names = {
         row["name"].partition("[")[0]
         for row in summary["parameters"]
         if not is_of_capture(row["name"])
     }
-    if missing := sorted(names - set(present)):
+    if missing := sorted(names - present):
         raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
 
 

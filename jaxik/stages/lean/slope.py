@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import quat, smoothing
-from jaxik.maths.parameter_tree import Leaf, constant, gain_per_tick, ratio, switch
+from jaxik.maths.parameter_tree import Leaf, half_life, ratio, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.world.frame import Contact, GroundHits, Slope
 from jaxik.world.skeleton import Rig
@@ -26,7 +26,7 @@ class SlopeLean(AbstractLean):
     The record calls this "undulation". The slope is that of the mean normal under the standing
     feet. A rate of 1 aligns the body with the normal, a negative rate leans it into the hill. The
     slope is smoothed before rates apply, so that the smoothed normal is available to the pelvis;
-    with `spring` on by a critically damped spring with the half-lives of the same gains.
+    with `spring` on by a critically damped spring with the same half-lives.
     """
 
     forward_rate: Leaf = ratio(
@@ -47,18 +47,17 @@ class SlopeLean(AbstractLean):
     side_rate_slide: Leaf = ratio(
         0.6, -1, 1, "Lean sideways per slope aside while the character slides."
     )
-    gain: Leaf = gain_per_tick(0.19, "Part of the gap that the smoothed slope closes in each tick.")
-    gain_slide: Leaf = gain_per_tick(
-        0.294, "Part of the gap that the smoothed slope closes in each tick of a slide."
+    half_life_slide: Leaf = half_life(
+        0.06637, "Time in which the smoothed slope covers half its way during a slide."
     )
-    slide_on_gain: Leaf = gain_per_tick(
-        0.226, "Part of the way into sliding rates covered in each tick as a slide begins."
+    slide_on_half_life: Leaf = half_life(
+        0.09019, "Time to half of the sliding rates as a slide begins."
     )
-    slide_off_gain: Leaf = gain_per_tick(
-        0.135, "Part of the way out of sliding rates covered in each tick as a slide ends."
+    slide_off_half_life: Leaf = half_life(
+        0.1593, "Time to half of the usual rates as a slide ends."
     )
+    half_life: Leaf = half_life(0.1096, "Time in which the smoothed slope covers half its way.")
     spring: Leaf = switch(False, "Whether the slope is smoothed by a critically damped spring.")
-    tick_hz: Leaf = constant(30, "Ticks per second that the gains refer to.", unit="Hz")
 
     def init(self, rig: Rig) -> LeanState:
         return LeanState.level(rig)
@@ -69,13 +68,19 @@ class SlopeLean(AbstractLean):
     def advance(self, now: SensedMoment, state: LeanState) -> tuple[LeanState, Lean]:
         gate, dt, slide = now.gate, now.dt, now.sensed.slide
         entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
-        slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
-        slide_fraction = smoothing.fraction_of_gain(slide_gain, dt, self.tick_hz)
+        slide_fraction = gate.choose(
+            entering,
+            smoothing.fraction_of_half_life(self.slide_on_half_life, dt),
+            smoothing.fraction_of_half_life(self.slide_off_half_life, dt),
+        )
         sliding = smoothing.lerp(state.slide, slide, now.progress(slide_fraction))
 
-        gain = smoothing.lerp(self.gain, self.gain_slide, sliding)
-        fraction = now.progress(smoothing.fraction_of_gain(gain, dt, self.tick_hz))
-        after = follow_slope(now, state, sliding, fraction, self.spring)
+        fraction = smoothing.lerp(
+            smoothing.fraction_of_half_life(self.half_life, dt),
+            smoothing.fraction_of_half_life(self.half_life_slide, dt),
+            sliding,
+        )
+        after = follow_slope(now, state, sliding, now.progress(fraction), self.spring)
 
         forward_rate = smoothing.lerp(self.forward_rate, self.forward_rate_slide, sliding)
         side_rate = smoothing.lerp(self.side_rate, self.side_rate_slide, sliding)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, constant, gain_per_tick, length, rate, ratio, switch
+from jaxik.maths.parameter_tree import Leaf, half_life, length, rate, ratio, switch
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Transform
 
@@ -29,7 +29,7 @@ class LowestPelvis(AbstractPelvis):
 
     Each foot requests the height from its animated ankle to its target. A foot that does not stand
     is blended, by its contact weight, into the highest request of all. With no foot standing the
-    goal is 0. Without a limit and with gains of 1 this is ozz's pelvis correction.
+    goal is 0. Without a limit and with half-lives of 0 this is ozz's pelvis correction.
 
     Down a slope a walker stands on the foot behind, which is higher, and swings the other towards
     lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then. It
@@ -41,11 +41,11 @@ class LowestPelvis(AbstractPelvis):
 
     enabled: Leaf = switch(True, "Whether the pelvis moves.")
     limit: Leaf = length(0.3, 0, 0.6, "Furthest that the pelvis moves up or down.")
-    on_gain: Leaf = gain_per_tick(
-        0.225, "Part of the gap that the pelvis closes in each tick while a foot stands."
+    airborne_half_life: Leaf = half_life(
+        0.1874, "Time in which the pelvis covers half its way while no foot stands."
     )
-    off_gain: Leaf = gain_per_tick(
-        0.116, "Part of the gap that the pelvis closes in each tick while no foot stands."
+    half_life: Leaf = half_life(
+        0.09065, "Time in which the pelvis covers half its way while a foot stands."
     )
     vertical_only: Leaf = switch(
         True, "Whether the pelvis moves along up, or along the ground's normal."
@@ -60,7 +60,6 @@ class LowestPelvis(AbstractPelvis):
         "Part of its length to which a standing leg may be folded; 0 folds it to any.",
         per_leg=True,
     )
-    tick_hz: Leaf = constant(30, "Ticks per second that the gains refer to.", unit="Hz")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -82,8 +81,8 @@ class LowestPelvis(AbstractPelvis):
         lowest = gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, smoothing.lerp(resting, lowest, standing), 0.0)
         fraction = smoothing.lerp(
-            smoothing.fraction_of_gain(self.off_gain, now.dt, self.tick_hz),
-            smoothing.fraction_of_gain(self.on_gain, now.dt, self.tick_hz),
+            smoothing.fraction_of_half_life(self.airborne_half_life, now.dt),
+            smoothing.fraction_of_half_life(self.half_life, now.dt),
             standing,
         )
         fraction = now.awake * now.progress(fraction)

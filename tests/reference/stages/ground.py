@@ -157,12 +157,16 @@ def lean(
     if state is None:
         slide, slope = float(frame.slide), [Motion(goal, 0.0) for goal in goals]
     else:
-        hz = parameters["lean.tick_hz"]
         direction = "on" if frame.slide > state.slide_weight else "off"
-        fraction = maths.fraction_of_gain(parameters[f"lean.slide_{direction}_gain"], hz, frame.dt)
+        fractions = {
+            name: maths.fraction_of_half_life(parameters[f"lean.{name}"], frame.dt)
+            for name in ("half_life", "half_life_slide", f"slide_{direction}_half_life")
+        }
+        fraction = fractions[f"slide_{direction}_half_life"]
         slide = lerp(state.slide_weight, float(frame.slide), fraction)
-        gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
-        half_life, spring = maths.half_life_of_gain(gain, hz), parameters["lean.spring"]
+        gain = lerp(fractions["half_life"], fractions["half_life_slide"], slide)
+        half_life = maths.half_life_of_gain(gain, 1.0 / frame.dt)
+        spring = parameters["lean.spring"]
         slope = [
             maths.follow(before, goal, half_life, frame.dt, spring)
             for before, goal in zip(state.slope, goals, strict=True)
@@ -334,7 +338,7 @@ def lowest_of(gaps: Sequence[float], weights: Sequence[float], loads: Sequence[f
     return min(top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True))
 
 
-def follow_by_gain(
+def follow_standing(
     parameters: Parameters,
     low: float,
     contact: float,
@@ -347,11 +351,11 @@ def follow_by_gain(
     goal = lerp(resting, low, contact)
     if before is None:
         return goal
-    off, on = (
-        maths.fraction_of_gain(parameters[f"pelvis.{name}_gain"], parameters["pelvis.tick_hz"], dt)
-        for name in ("off", "on")
+    airborne, standing = (
+        maths.fraction_of_half_life(parameters[f"pelvis.{name}"], dt)
+        for name in ("airborne_half_life", "half_life")
     )
-    return lerp(before, goal, lerp(off, on, contact))
+    return lerp(before, goal, lerp(airborne, standing, contact))
 
 
 def pelvis_height(
@@ -368,7 +372,7 @@ def pelvis_height(
     low = max([low, *unfolded_heights(parameters, low, feet, targets, up)])
     contact = max(weights)
     resting = before if before and parameters["pelvis.wait_to_rise"] else 0.0
-    return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt, resting)
+    return follow_standing(parameters, low, contact, before, feet[0].frame.dt, resting)
 
 
 def unfolded_heights(

@@ -17,7 +17,7 @@ DEFAULTS = (
     | named("root", half_life=0.2, max_speed=4.0, max_step=0.4, max_gap=0.15)
     | named("probe", ray_up=0.5, ray_down=math.inf)
     | named("target", foot_height=0.12, max_slope=1.5)
-    | named("pelvis", enabled=True, limit=math.inf, on_gain=1.0, off_gain=1.0, tick_hz=30.0)
+    | named("pelvis", enabled=True, limit=math.inf, half_life=0.0, airborne_half_life=0.0)
     | named("leg", enabled=True, soften=1.0, twist=0.0, weight=1.0)
     | named("foot", enabled=True, twist=0.0, weight=1.0, offset=np.zeros(3))
 )
@@ -160,7 +160,7 @@ def pelvis_height(
     contact = max(weights) if parameters["pelvis.enabled"] else 0.0
     before = state.pelvis_height if state else None
     low = ground.lowest_of(gaps, weights, [foot.weight for foot in feet])
-    return ground.follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)
+    return ground.follow_standing(parameters, low, contact, before, feet[0].frame.dt)
 
 
 def aim_foot(foot: Foot, ankle: maths.Transform, weight: float) -> tuple[Array, bool]:
