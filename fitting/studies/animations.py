@@ -49,8 +49,7 @@ from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, quat, vec
-from jaxik.stages.probe import StrideProbe
-from jaxik.stages.probe.limits import AbstractLimitedProbe
+from jaxik.stages.probe import AbstractLimitedProbe, StrideProbe
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
 

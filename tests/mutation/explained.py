@@ -99,13 +99,13 @@ REASONS = {
         ("beyond, distance, 1.0", "beyond, distance, 2.0", STAND_IN),
         ("(behind, gap, 1.0), 0.0)", "(behind, gap, 1.0), 1.0)", STAND_IN),
     ],
-    "jaxik/stages/pelvis/games.py": [
+    "jaxik/stages/pelvis.py": [
         ("goal - state.height", "goal + state.height", "only tells whether to jump, by 0.1 mm")
     ],
     "jaxik/stages/probe/stride.py": [
         ("away > self.max_step_up", "away >= self.max_step_up", BOUNDARY)
     ],
-    "jaxik/stages/probe/limits.py": [
+    "jaxik/stages/probe/base.py": [
         (
             "(above > 0, above, 0.0)",
             "(above > 0, above, -1.0)",

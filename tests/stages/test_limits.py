@@ -18,8 +18,7 @@ from jaxik import HARD
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import with_option
 from jaxik.stages.inputs import Inputs
-from jaxik.stages.probe import foot_heading
-from jaxik.stages.probe.limits import AbstractLimitedProbe
+from jaxik.stages.probe import AbstractLimitedProbe, foot_heading
 from jaxik.world.frame import GroundHits
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths

@@ -16,8 +16,7 @@ from jaxik.stages import foot
 from jaxik.stages.contact import SpeedState
 from jaxik.stages.effector import BodyEffector, BodyState
 from jaxik.stages.inputs import Inputs, SensedMoment
-from jaxik.stages.lock import OffsetLock, PlantLock
-from jaxik.stages.lock.offset import LockState
+from jaxik.stages.lock import LockState, OffsetLock, PlantLock
 from jaxik.stages.pelvis import PelvisState
 from jaxik.stages.probe import swing
 from jaxik.stages.target import SlopeTarget, TargetState

@@ -11,6 +11,7 @@ from jaxik.world.frame import Contact, GroundHits, animated_ankles
 from jaxik.world.terrain import Hit
 
 from .base import (
+    AbstractLimitedProbe,
     foot_heading,
     level_origin,
     make_rays,
@@ -21,7 +22,6 @@ from .base import (
     toe_point,
     with_weight,
 )
-from .limits import AbstractLimitedProbe
 
 HEIGHT_BAND = 0.01  # m
 SPEED_BAND = 0.05  # m/s

@@ -18,8 +18,7 @@ from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
 from . import foresight
-from .base import foot_heading, make_rays, no_hit
-from .limits import climb, least_rise
+from .base import climb, foot_heading, least_rise, make_rays, no_hit
 from .support import AbstractSupportedProbe, Tread
 from .swing import FAR, Level, s_curve
 

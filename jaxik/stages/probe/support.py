@@ -14,7 +14,7 @@ from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
-from .limits import climb
+from .base import climb
 from .swing import AbstractSwingProbe, Level
 
 # In tenths of a sole, from the ball: the points of a sole, and how far it may slide.

@@ -10,8 +10,7 @@ from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Stride, animated_ankles
 
-from .base import foot_heading, level_origin
-from .limits import AbstractLimitedProbe, least_rise
+from .base import AbstractLimitedProbe, foot_heading, least_rise, level_origin
 
 HEIGHT_BAND = 0.01  # m
 BLEND = 0.3  # of an arc over an edge, in which the animated lift gives way to it

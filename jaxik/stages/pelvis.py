@@ -1,48 +1,339 @@
-"""Pelvis rules modelled on people, who ride on their support and reach as far as their legs go."""
+"""Stage 9: how far the body sinks or rises so that its legs can reach the ground.
+
+After what all rules share come those of games: the lowest foot, a capsule that shrinks, limits on
+leg length. Last are those modelled on people, who ride on their support and reach as far as their
+legs go. To write a rule, start with `AbstractPelvis`, or with `AbstractFollowingPelvis`, which only
+needs a goal.
+"""
 
 import dataclasses
+import itertools
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.gate import HARD
+from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.maths.parameter_tree import (
     Leaf,
+    Rule,
     constant,
     duration,
     half_life,
     length,
+    rate,
     ratio,
     speed,
     switch,
 )
-from jaxik.maths.struct import struct
-from jaxik.stages.inputs import GRAVITY, STAIRS
-from jaxik.world.frame import Landing
+from jaxik.maths.struct import place, struct
+from jaxik.stages.inputs import GRAVITY, STAIRS, SensedMoment
+from jaxik.stages.lean import Lean
+from jaxik.world.frame import Landing, Sensed
 from jaxik.world.skeleton import Rig, Transform, mean_position
 
-from .base import (
-    FAR,
-    HEIGHT_BAND,
-    AbstractPelvis,
-    Approach,
-    PelvisMoment,
-    PelvisState,
-    greatest_load,
-    highest_of,
-    limits_of,
-    lowest_of,
-    mean_height,
-    rise_to_length,
-    supported_heights,
-)
-
+HEIGHT_BAND = 0.01  # m
+FAR = 1e6  # m, beyond any leg
 EARLIEST = 10.0  # landing times before a landing; its share is then less than numbers resolve
 FASTEST = 2.0  # m/s, of a root that climbs; one that is faster has jumped
+
+
+@struct
+class Approach:
+    """What tells, a frame later, how fast swings end and the root rises."""
+
+    fraction: Float[Array, " legs"]
+    """0..1, time of each swing that has passed."""
+    speed: Float[Array, ""]
+    """m/s, at which root and offset rose over the ground together."""
+    root_height: Float[Array, ""] = place("height")
+    """Metres."""
+
+
+@struct
+class PelvisState:
+    """The offset of the body from its animation."""
+
+    height: Float[Array, ""]
+    """Metres."""
+    velocity: Float[Array, ""]
+    """m/s; 0 unless it follows as a spring."""
+    goal: Float[Array, ""]
+    """m, where the height is going."""
+    offset_ws: Float[Array, "3"]
+    """Metres."""
+    half_height: Float[Array, ""]
+    """m, of the capsule; 0 where a rule has none."""
+    ahead: Float[Array, ""]
+    """m, along the character's heading; 0 where a rule does not shift the body."""
+    approach: Approach | None = None
+    """None where a rule does not look at where feet land."""
+
+    @classmethod
+    def level(cls, rig: Rig) -> "PelvisState":
+        """No offset."""
+        zero = jnp.zeros((), rig.side.dtype)
+        return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero, zero)
+
+    @classmethod
+    def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
+        """An offset of `height`, m, along `up_ws`, at rest."""
+        zero = jnp.zeros_like(height)
+        return cls(height, zero, goal, vec.scale(up_ws, height), zero, zero)
+
+
+@struct
+class PelvisMoment(SensedMoment):
+    """A moment, with what only the pelvis reads."""
+
+    lean: Lean
+    awake: Float[Array, ""]
+    """0 while the body is to stay where it is, else 1."""
+
+
+class AbstractPelvis(Rule):
+    """Moves the body up and down, and perhaps forward and back."""
+
+    per_leg: ClassVar[bool] = False
+
+    def init(self, rig: Rig) -> PelvisState:
+        """Memory before the first frame."""
+        return PelvisState.level(rig)
+
+    @abstractmethod
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        """Memory after this frame, which holds the offset.
+
+        Args:
+            now: the sensed frame. With `now.awake` 0 the body is to stay where it is.
+            target: where the ankles are to go (legs), world space.
+            state: memory after the frame before.
+        """
+
+
+def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
+    """Mean of requested heights, m, weighted by the load of each leg; 0 if no leg counts."""
+    mean = vec.safe_divide(vec.sum_last(sensed.load * requested), vec.sum_last(sensed.load))
+    return mean * greatest_load(sensed)
+
+
+def greatest_load(sensed: Sensed) -> Float[Array, ""]:
+    """0..1, the load of the leg that has most."""
+    return HARD.maximum(sensed.load, band=0.0)
+
+
+def limits_of(sensed: Sensed, heights: Array, free: Array) -> Float[Array, " legs"]:
+    """Heights, m, as limits: the less load a leg has, the less is its limit below `free`, m."""
+    below = jnp.where(heights < free, free - heights, 0.0)
+    return jnp.where(sensed.load > 0, heights + (1.0 - sensed.load) * below, FAR)
+
+
+def lowest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
+    """The lowest of the heights of legs, m; 0 if none has any load.
+
+    It is the mean over all choices of some of the legs, each of which has its load as probability:
+    so a change of a load by x moves it by at most x times what that leg moves it at all.
+    """
+    heights = jnp.where(sensed.load > 0, heights, 0.0)
+    loads, each = vec.unstack(sensed.load), vec.unstack(heights)
+
+    def is_lower(leg: int, other: int) -> Array:
+        """1 if so, else 0; of two that are equal, the first is lower."""
+        if leg > other:
+            return 1.0 - is_lower(other, leg)
+        return gate.below(each[leg], each[other], band=HEIGHT_BAND)
+
+    shares = list(loads)
+    for leg, other in itertools.permutations(range(len(loads)), 2):
+        shares[leg] *= 1.0 - loads[other] * is_lower(other, leg)
+    share = vec.stack(*shares)
+    return vec.safe_divide(vec.sum_last(share * heights), vec.sum_last(share))
+
+
+def highest_of(gate: AbstractGate, sensed: Sensed, heights: Array) -> Float[Array, ""]:
+    """The highest of the heights of legs, m, likewise."""
+    return -lowest_of(gate, sensed, -heights)
+
+
+def rise_to_length(
+    sensed: Sensed, hip_ws: Array, ankle_ws: Array, length: Array
+) -> Float[Array, " legs"]:
+    """How far the body has to rise until each hip is `length` from its ankle, m.
+
+    For an ankle further aside than that, the height at which it is nearest.
+    """
+    leg = ankle_ws - hip_ws
+    height = vec.dot(leg, sensed.up_ws)
+    aside2 = vec.dot(leg, leg) - height**2
+    return height + vec.safe_sqrt(length**2 - aside2)
+
+
+def requested_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """Height from each animated ankle to its target along the leg's up, m."""
+    return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)
+
+
+def supported_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """The same less what feet swing higher than animated: nobody rises with a lifted foot, m."""
+    requested, lift = requested_heights(sensed, target_ws), sensed.ground.lift
+    return requested if lift is None else requested - lift
+
+
+class LowestPelvis(AbstractPelvis):
+    """Follows the standing foot that requests the lowest body (the record's "height offset").
+
+    Each foot requests the height from its animated ankle to its target. A foot that does not stand
+    is blended, by its contact weight, into the highest request of all. With no foot standing the
+    goal is 0. Without a limit and with half-lives of 0 this is ozz's pelvis correction.
+
+    Down a slope a walker stands on the foot behind, which is higher, and swings the other towards
+    lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then. It
+    also stays where it is while no foot stands.
+
+    A squatter's leg cannot fold much further. With `min_extension` above 0 the body rises with a
+    standing foot that would fold it more, unless the animation does.
+    """
+
+    enabled: Leaf = switch(True, "Whether the pelvis moves.")
+    limit: Leaf = length(0.3, 0, 0.6, "Furthest that the pelvis moves up or down.")
+    airborne_half_life: Leaf = half_life(
+        0.1874, "Time in which the pelvis covers half its way while no foot stands."
+    )
+    half_life: Leaf = half_life(
+        0.09065, "Time in which the pelvis covers half its way while a foot stands."
+    )
+    vertical_only: Leaf = switch(
+        True, "Whether the pelvis moves along up, or along the ground's normal."
+    )
+    wait_to_rise: Leaf = switch(
+        False, "Whether the pelvis rises only as far as feet that swing ask for as well."
+    )
+    min_extension: Leaf = ratio(
+        0,
+        0,
+        0.8,
+        "Part of its length to which a standing leg may be folded; 0 folds it to any.",
+        per_leg=True,
+    )
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        requested = requested_heights(sensed, target.pos)
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.load
+        highest = highest_of(gate, sensed, requested)
+        of_standing = smoothing.lerp(highest, requested, weight)
+        lowest = gate.minimum(of_standing, band=HEIGHT_BAND)
+        of_all = lowest_of(gate, sensed, requested)
+        zero = jnp.zeros_like(lowest)
+        rise = gate.clip(of_all, zero, zero + jnp.inf, band=HEIGHT_BAND)
+        waiting = gate.clip(lowest, zero - jnp.inf, rise, band=HEIGHT_BAND)
+        lowest = jnp.where(self.wait_to_rise, waiting, lowest)
+        least = jnp.where(weight > 0, self._least_heights(sensed, target), lowest)
+        unfolded = jnp.where(least > lowest, smoothing.lerp(lowest, least, weight), lowest)
+        lowest = gate.maximum(unfolded, band=HEIGHT_BAND)
+        standing = gate.maximum(weight, band=0.1)
+        resting = jnp.where(self.wait_to_rise, state.height, 0.0)
+        lowest = gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, smoothing.lerp(resting, lowest, standing), 0.0)
+        fraction = smoothing.lerp(
+            smoothing.fraction_of_half_life(self.airborne_half_life, now.dt),
+            smoothing.fraction_of_half_life(self.half_life, now.dt),
+            standing,
+        )
+        fraction = now.awake * now.progress(fraction)
+        height = smoothing.lerp(state.height, goal, fraction)
+        direction_ws = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
+        return PelvisState.at(height, goal, direction_ws)
+
+    def _least_heights(self, sensed: Sensed, target: Transform) -> Float[Array, " legs"]:
+        """The heights of the body up to which each leg is folded too far, m."""
+        animated = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        shortest = self.min_extension * (sensed.thigh + sensed.shin)
+        shortest = jnp.where(animated < shortest, animated, shortest)
+        # A folded leg whose foot is far aside is long enough at any height.
+        least = rise_to_length(sensed, sensed.hip_ws, target.pos, shortest)
+        return jnp.where(self.min_extension > 0, least, -FAR)
+
+
+class CapsulePelvis(AbstractPelvis):
+    """Sinks to the lowest foot and never rises, and shrinks the capsule (Unreal).
+
+    The goal is the lowest height that a foot requests, or 0 if that is above 0. The capsule's
+    half-height goes to its full value less half of that depth. Both follow by the clamped-speed law
+    of Unreal's interp-to. With `enabled` off both go back.
+    """
+
+    enabled: Leaf = switch(True, "Whether the pelvis sinks.")
+    speed: Leaf = rate(15, 0.5, 30, "Rate at which pelvis and capsule follow their goals.")
+    half_height: Leaf = length(0.9, 0.3, 2, "Half the height of the character's capsule at rest.")
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        requested = sensed.load * requested_heights(sensed, target.pos)
+        lowest = gate.minimum(requested, band=HEIGHT_BAND)
+        zero = jnp.zeros_like(lowest)
+        sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, sunk, 0.0)
+
+        def follow(value: Array, goal: Array) -> Array:
+            fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - value)
+            return smoothing.lerp(value, goal, now.awake * now.progress(fraction))
+
+        height = follow(state.height, goal)
+        half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
+        after = PelvisState.at(height, goal, sensed.up_ws)
+        return dataclasses.replace(after, half_height=half_height)
+
+
+class LegLengthPelvis(AbstractPelvis):
+    """Keeps the distance from each hip to its ankle's target within the leg's limits (Mec).
+
+    Of all heights that do, it takes the one nearest to the animation. Where one leg needs the body
+    higher and another needs it lower, it takes the lower, so that no leg is over-stretched. A foot
+    too far aside to be reached requests the height that comes nearest. With `damp` on the offset
+    follows by the clamped-speed law of Unreal's interp-to.
+
+    Mec measures to the position that it found for the foot, which is its height above the contact
+    with the ground, not to the contact itself: a leg that is as long as from hip to ankle then
+    leaves a body alone that stands on flat ground.
+    """
+
+    enabled: Leaf = switch(True, "Whether the pelvis moves.")
+    min_length: Leaf = length(
+        0.5, 0, 1, "Shortest distance from hip to ankle that the pelvis allows.", per_leg=True
+    )
+    max_length: Leaf = length(
+        0.88,
+        0.2,
+        1.5,
+        "Longest distance from hip to ankle that the pelvis allows.",
+        above="min_length",
+        per_leg=True,
+    )
+    damp: Leaf = switch(
+        True, "Whether the pelvis follows its goal smoothly; if not, it jumps there."
+    )
+    speed: Leaf = rate(10, 0.5, 30, "Rate at which the pelvis follows its goal.")
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        lowest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.min_length)
+        highest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.max_length)
+        found = sensed.foothold.found > 0
+        zero = jnp.zeros_like(lowest[:1])
+        floors = jnp.where(found, limits_of(sensed, -lowest, jnp.zeros_like(lowest)), FAR)
+        floor = -gate.minimum(jnp.concatenate([floors, zero]), band=HEIGHT_BAND)
+        ceilings = jnp.where(found, limits_of(sensed, highest, floor), FAR)
+        ceilings = jnp.concatenate([ceilings, floor[None]])
+        goal = jnp.where(self.enabled, gate.minimum(ceilings, band=HEIGHT_BAND), 0.0)
+
+        fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        fraction = now.awake * jnp.where(now.started & self.damp, fraction, 1.0)
+        height = smoothing.lerp(state.height, goal, fraction)
+        return PelvisState.at(height, goal, sensed.up_ws)
 
 
 @struct
