@@ -157,6 +157,7 @@ def by_reference(
             for leg in range(2)
         ]
         before = [swing for swing, *_ in swings]
+        reference.take_first_steps(before)
         regular = reference.regularity(before)
         for leg, (swing, last, following) in enumerate(swings):
             yield (n, leg), swing, regular, last, following

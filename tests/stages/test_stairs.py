@@ -44,8 +44,8 @@ def test_they_do_so_on_rubble_curbs_ledges_and_ramps():
 @pytest.mark.parametrize(
     ("start", "least"),
     [
-        pytest.param(SETTLED, Verdict(0.985, 0.985, 0.995, 0.95, 1.0), id="from the first stride"),
-        pytest.param(STEPPED, Verdict(0.995, 0.995, 1.0, 0.99, 1.0), id="after a step"),
+        pytest.param(SETTLED, Verdict(0.99, 0.985, 0.995, 0.955, 1.0), id="from the first stride"),
+        pytest.param(STEPPED, Verdict(0.998, 0.998, 1.0, 0.99, 1.0), id="after a step"),
     ],
 )
 def test_feet_stand_on_treads_that_nothing_foretells(start, least):
@@ -55,7 +55,7 @@ def test_feet_stand_on_treads_that_nothing_foretells(start, least):
     ik = jaxik.presets.stride(foretold=False)
     verdicts = np.array([verdict for _, verdict in walked(ik, chosen, known=False, start=start)])
     assert ((verdicts <= np.array(BOUNDS)).mean(0) >= least).all()
-    assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.08]).all()
+    assert (verdicts[:, 1:4] <= [0.05, 0.06, 0.082]).all()
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ UNSURE, SURE = 0.7, 0.88  # of a swing, between which a foot chooses where it wi
 EARLIER = 0.24  # of a swing, by how much earlier it chooses if the swing goes as foreseen
 # Of its way: where it leads has changed by less since it began, or by more.
 AS_FORESEEN, OTHERWISE = 0.08, 0.2
+NOWHERE = 0.9  # of its way, from which a step that lands as far from it tells nothing of the next
 BY_MOTION = 0.6  # how far the motion of the ball counts, beside time and pitch of the sole
 FARTHEST = 0.15  # of a swing, by which it may differ from these
 FRACTION_BAND = 0.02  # of a swing
@@ -295,8 +296,9 @@ def follow_swings(
     how far it still goes, its pace counts as well as its pitch.
 
     How long a foot swings, and how early it lands before its hip is over it, are the usual times at
-    first, then more and more those of its own steps. Where all feet landed as foreseen in their
-    last steps, a swing goes by that time, as far as it is learnt, rather than by its pitch.
+    first, then those of another foot that has made a step, then more and more those of its own
+    steps. Where all feet landed as foreseen in their last steps, a swing goes by that time, as far
+    as it is learnt, rather than by its pitch.
 
     Args:
         now: the frame.
@@ -368,7 +370,8 @@ def follow_swings(
     foot_velocity = vec.scale(moved, vec.safe_divide(jnp.ones_like(dt), dt))
     next_ws = _landing(feet, swings, foot_velocity)
     way = gate.choose(feet.planted[:, None], _way(feet, swings, next_ws), before.first_way_ws)
-    return dataclasses.replace(swings, first_way_ws=way), next_ws
+    landed = jnp.where(feet.rig.present, landed, 0.0)
+    return _with_first_steps(dataclasses.replace(swings, first_way_ws=way), landed), next_ws
 
 
 def _learnt(
@@ -400,6 +403,18 @@ def _learnt(
     usual_lead = jnp.where(now.started, before.lead, 0.5 * stance_time)
     learnt = LEARNT * landed
     return smoothing.lerp(usual_swing, swung, learnt), smoothing.lerp(usual_lead, lead, learnt)
+
+
+def _with_first_steps(swings: Swings, landed: Array) -> Swings:
+    """Feet to which their own steps have told nothing take the times of those that land, 0..1."""
+    count = vec.sum_last(landed)
+    unknown = smoothing.smoothstep((swings.missed - NOWHERE) / (1.0 - NOWHERE)) * (1.0 - landed)
+    share = unknown * smoothing.clip_to_one(count)
+
+    def taken(own: Array) -> Array:
+        return smoothing.lerp(own, vec.safe_divide(vec.sum_last(landed * own), count), share)
+
+    return dataclasses.replace(swings, swing_time=taken(swings.swing_time), lead=taken(swings.lead))
 
 
 def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: AbstractGate) -> Instant:

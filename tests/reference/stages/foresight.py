@@ -39,6 +39,8 @@ class Swing:
     """From landing until the hip is over the ball."""
     missed: float = 1.0
     """By what part of its way its last step landed elsewhere than foreseen as it began."""
+    landed: float = 0.0
+    """How far it has landed in this frame, after a swing that was seen from its start."""
 
 
 def duration(time: float, fraction: float, usual: float) -> float:
@@ -53,6 +55,18 @@ def as_foreseen(changed: float) -> float:
 def regularity(swings: list[Swing]) -> float:
     """How far all feet last landed as foreseen."""
     return min(as_foreseen(swing.missed) for swing in swings)
+
+
+def take_first_steps(swings: list[Swing]) -> None:
+    """Feet that know nothing from steps of their own take the times of those that land now."""
+    landed = sum(swing.landed for swing in swings)
+    if landed == 0.0:
+        return
+    usual = sum(swing.landed * swing.usual for swing in swings) / landed
+    lead = sum(swing.landed * swing.lead for swing in swings) / landed
+    for swing in swings:
+        share = smooth01((swing.missed - 0.9) / 0.1) * (1.0 - swing.landed) * min(landed, 1.0)
+        swing.usual, swing.lead = lerp(swing.usual, usual, share), lerp(swing.lead, lead, share)
 
 
 def follow(
@@ -126,6 +140,7 @@ def follow(
         beyond *= 0.6 * before.whole * smooth01((fraction - 0.3) / 0.15)
         correction = maths.fraction_of_half_life(0.035, dt)
         further, whole = lerp(before.further, beyond, correction), before.whole
+    landed = 0.0
     if planted:
         if before is None:
             travelled = np.zeros(3)
@@ -136,6 +151,7 @@ def follow(
                 missed = lerp(missed, min(miss / length(travelled), 1.0), away)
             travelled = travelled * (1.0 - away)
             if before.whole:  # 70 % of a step count for the next
+                landed = away
                 flat = across(smooth, up)
                 last_lead = float((ball - hip) @ flat / (flat @ flat)) if flat @ flat > 0 else 0.0
                 lead = lerp(lead, clip(last_lead, 0.0, stance), 0.7 * away)
@@ -158,6 +174,7 @@ def follow(
         usual,
         lead,
         missed,
+        landed,
     )
     fraction = clip(fraction + further, 0.0, LAST)
     lasts = duration(time, fraction, usual)
