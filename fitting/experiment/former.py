@@ -46,8 +46,8 @@ HALF_LIVES = {  # by the name of the gain per tick that each was
     "lean.slide_on_gain": "lean.slide_on_half_life",
     "lean.slide_off_gain": "lean.slide_off_half_life",
 }
-TICK_HZ = 30.0  # unless a file says otherwise
-GAINS = {"low": 0.01, "high": 0.95}  # between which a gain was fitted, likewise
+TICK_HZ = 30.0  # to which gains refer, unless a file says otherwise
+GAINS = {"low": 0.01, "high": 0.95}  # between which gains were fitted, likewise
 
 
 def parameters_with_half_lives(values: Table, leaves: Collection[str]) -> Content:
@@ -76,7 +76,7 @@ def free_with_half_lives(table: Table, leaves: Collection[str]) -> Content:
 
 
 def row_with_half_life(row: Table) -> Table:
-    """The same for a fitted parameter: what sampling reads of a gain, with which `u` rose."""
+    """The same for a fitted parameter: what sampling reads of it; `u` rose with the gain."""
     if row["name"] not in HALF_LIVES or row["unit"] != "1/tick":
         return row
     half_life = {"name": HALF_LIVES[row["name"]], "unit": "s", "value": _half_life(row["value"])}
@@ -84,7 +84,7 @@ def row_with_half_life(row: Table) -> Table:
 
 
 def _is_gain(name: str, leaves: Collection[str]) -> bool:
-    """Whether a system with these leaves has the half-life instead; a rule may have such a gain."""
+    """Whether a system with these leaves has a half-life in place of a gain of this name."""
     return name not in leaves and HALF_LIVES.get(name) in leaves
 
 
