@@ -106,9 +106,9 @@ def test_a_problem_has_the_clips_cut_and_resampled_alike_and_starts_at_the_value
     space, (scene,) = problem.space, problem.data
     assert not parameter_tree.get(space.system, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(space.system, "foot.max_pitch"), [0.3, 0.5])
-    gain = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
+    half_life = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
     assert space.names == ("pelvis.half_life", "foot.max_pitch")
-    np.testing.assert_allclose(space.values(space.start), [gain, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(space.values(space.start), [half_life, 0.4], rtol=1e-6)
     assert scene.frames.dt.shape == (16,) and float(scene.frames.dt[0]) == pytest.approx(1 / 15)
     frames = slice(30, 61, 2)
     ankles = reference.joints_ws(2)[frames]

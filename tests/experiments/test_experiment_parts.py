@@ -278,7 +278,7 @@ def test_tracks_of_a_clip_survive_its_file_and_its_edits(clip, tmp_path):
 
 @pytest.mark.slow
 def test_the_cost_follows_the_track(tmp_path):
-    """Of a second in which a track limits the pelvis, which moves with a known gain."""
+    """Of a second in which a track limits the pelvis, which moves with a known half-life."""
     text = "[pelvis.limit]\ntimes = [1.0, 1.4, 1.8]\nvalues = [0.3, 0.02, 0.3]\n"
     (tmp_path / "tracks.toml").write_text(text)
     path = write(

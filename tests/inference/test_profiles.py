@@ -127,35 +127,35 @@ def test_a_profile_is_the_exact_one_where_the_cost_is_low_and_at_the_ends_of_its
 
 # Heights of intervals: chi-square's, or higher beside a plateau that noise undercuts
 
-GAIN = free_parameter(toy.Toy(), "body.half_life")
+HALF_LIFE = free_parameter(toy.Toy(), "body.half_life")
 U = np.unique(np.concatenate([np.linspace(-6, 6, 241), np.linspace(-0.02, 0.02, 21)]))
 
 
-def gains(u: np.ndarray) -> np.ndarray:
-    return from_fractions(GAIN, 1 / (1 + np.exp(-u)))
+def half_lives(u: np.ndarray) -> np.ndarray:
+    return from_fractions(HALF_LIFE, 1 / (1 + np.exp(-u)))
 
 
 def test_heights_and_levels_of_a_parabola_are_those_of_chi_square():
     for sd, step in itertools.product((0.05, 0.3, 1.6), (0.3, 1.0)):
         u = 0.4 + sd * np.arange(-5, 5.1, step)  # few points suffice
-        height = max_rise(GAIN, gains(u), 0.5 * ((u - 0.4) / sd) ** 2)
+        height = max_rise(HALF_LIFE, half_lives(u), 0.5 * ((u - 0.4) / sd) ** 2)
         assert RISE_OF_SMOOTH <= height < 1.1 * RISE_OF_SMOOTH, (sd, step)
     u = np.linspace(-3, 3, 31)
     for rise in (0.1, 0.5, 1.92, 4.0):
-        level = level_of(GAIN, gains(u), 0.5 * (u / 0.5) ** 2, rise)
+        level = level_of(HALF_LIFE, half_lives(u), 0.5 * (u / 0.5) ** 2, rise)
         assert level == pytest.approx(scipy.stats.chi2(1).cdf(2 * rise), abs=0.02)
-    assert max_rise(GAIN, gains(np.zeros(1)), np.zeros(1)) == RISE_OF_SMOOTH
+    assert max_rise(HALF_LIFE, half_lives(np.zeros(1)), np.zeros(1)) == RISE_OF_SMOOTH
 
 
 def test_a_narrow_minimum_does_not_exclude_a_wide_plateau_but_for_one_out_of_reach():
     narrow, prior = 0.5 * (U / 0.005) ** 2, 0.5 * (U / 1.6) ** 2
-    height = max_rise(GAIN, gains(U), np.minimum(3.0 + prior, narrow))
+    height = max_rise(HALF_LIFE, half_lives(U), np.minimum(3.0 + prior, narrow))
     share_of_plateau = np.exp(-3) * 1.6 / (np.exp(-3) * 1.6 + 0.005)
     assert share_of_plateau > 0.9
     inside = scipy.stats.norm(scale=1.6).cdf(np.sqrt(2 * (height - 3)) * 1.6)
     level = share_of_plateau * (2 * inside - 1) + 1 - share_of_plateau
     assert level == pytest.approx(0.95, abs=0.01)
-    height = max_rise(GAIN, gains(U), np.minimum(12.0 + prior, narrow))
+    height = max_rise(HALF_LIFE, half_lives(U), np.minimum(12.0 + prior, narrow))
     assert height == pytest.approx(RISE_OF_SMOOTH, rel=0.1)
 
 

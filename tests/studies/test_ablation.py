@@ -36,7 +36,7 @@ EVERYTHING = "everything"
 
 
 class Search:
-    """A search that remembers its calls; the gain it finds is a thousandth of the frame count."""
+    """A search that remembers its calls; it finds a thousandth of the frame count, in s."""
 
     def __init__(self) -> None:
         self.calls: list = []
@@ -90,17 +90,17 @@ free = { pelvis.lowest_share = { low = 0.1 } }
 
 def test_an_ablation_drops_parameters_that_its_rules_do_not_have_but_no_mistakes(tmp_path):
     rest = "[parameters]\npelvis.limit = 0.3\nlock.enabled = false\n"
-    free = 'pelvis.half_life = {}\nfoot."max_pitch[0]" = {}\npelvis.of_gain = {}\n'
+    free = 'pelvis.half_life = {}\nfoot."max_pitch[0]" = {}\npelvis.half_lif = {}\n'
     experiment = load(tmp_path, rest, free=free)
     variant = ablation.without(
         experiment, Ablation("p", {"pelvis": "CapsulePelvis"}, {"pelvis.speed": 4.0})
     )
     assert variant.rules == {"pelvis": "CapsulePelvis"}
     assert variant.parameters == {"lock.enabled": False, "pelvis.speed": 4.0}
-    assert set(variant.free) == {"foot.max_pitch[0]", "pelvis.of_gain"}
+    assert set(variant.free) == {"foot.max_pitch[0]", "pelvis.half_lif"}
     variant = ablation.without(experiment, Ablation("f", {}, {"foot.max_pitch": 0.2}))
     assert variant.parameters["foot.max_pitch"] == 0.2 and variant.rules == {}
-    assert set(variant.free) == {"pelvis.half_life", "pelvis.of_gain"}
+    assert set(variant.free) == {"pelvis.half_life", "pelvis.half_lif"}
 
 
 # Splits
@@ -161,10 +161,10 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     assert observed[2].mean() > 0.9
     captured, base, *_ = load_clip_data(experiment)
     difference = (base.positions_ws - captured.positions_ws)[:, captured.rig.pelvis, 1]
-    gains = [float(frames.sum()) / 1000 for frames in observed] + [0.6] * 3
-    for row, gain in zip(rows, gains, strict=True):
+    half_lives = [float(frames.sum()) / 1000 for frames in observed] + [0.6] * 3
+    for row, half_life in zip(rows, half_lives, strict=True):
         part = {1: slice(0, 90), 2: slice(90, 181), 0: slice(0, 181)}[row.part]
-        expected = np.sqrt(np.mean((difference[part] + gain) ** 2))
+        expected = np.sqrt(np.mean((difference[part] + half_life) ** 2))
         assert row.agreement.pelvis == pytest.approx(expected, rel=1e-6), (row.variant, row.part)
     assert rows[6].message == "Nothing is free." and rows[6].converged
     assert rows[0].message == "Done." and rows[0].seconds == 0.5

@@ -56,13 +56,13 @@ def fitted(made) -> Population:
 
 
 def test_clips_are_fitted_alone_pooled_and_as_a_population(fitted):
-    gain, pitch = fitted.parameters
-    assert (gain["level"], pitch["level"]) == ("clip", "shared")
-    alone = [estimate["value"] for estimate in gain["alone"]]
+    half_life, pitch = fitted.parameters
+    assert (half_life["level"], pitch["level"]) == ("clip", "shared")
+    alone = [estimate["value"] for estimate in half_life["alone"]]
     np.testing.assert_allclose(alone, [values[0] for values in MEASURED], atol=0.01)
-    assert 0.2 < gain["pooled"]["value"] < 0.5 and gain["pooled"]["interval"] is not None
-    within = [estimate["value"] for estimate in gain["clips"]]
-    centre, spread = gain["centre"]["value"], gain["spread"]
+    assert 0.2 < half_life["pooled"]["value"] < 0.45 and half_life["pooled"]["interval"] is not None
+    within = [estimate["value"] for estimate in half_life["clips"]]
+    centre, spread = half_life["centre"]["value"], half_life["spread"]
     assert (np.abs(np.subtract(within, centre)) < np.abs(np.subtract(alone, centre))).all()
     np.testing.assert_allclose(within, alone, atol=0.03)
     assert spread is not None and spread["interval"] is not None
@@ -83,17 +83,21 @@ def test_a_clip_that_is_left_out_is_predicted_by_the_others_alone(fitted):
 
 
 def test_a_subject_that_others_show_is_expected_as_they_show_it(tmp_path, monkeypatch):
-    measured, table = ((0.2, 0.4), (0.2, 0.4), (0.5, 0.4)), VARYING.replace("clip", "subject")
+    measured, table = ((0.2, 0.4), (0.2, 0.4), (0.45, 0.4)), VARYING.replace("clip", "subject")
     fitted = fitting.population(
         small_studies.quick_population(tmp_path, monkeypatch, measured, table)
     )
     first, second, other = fitted.errors
     assert max(first.left_out_population, second.left_out_population) < 0.03
     assert min(first.left_out_pooled, second.left_out_pooled) > 0.08
-    assert other.left_out_population == pytest.approx(0.3, abs=0.05)
-    gain = fitted.parameters[0]
-    assert gain["level"] == "subject"
-    assert gain["clips"][0]["value"] == gain["clips"][1]["value"] < gain["clips"][2]["value"]
+    assert other.left_out_population == pytest.approx(0.25, abs=0.05)
+    half_life = fitted.parameters[0]
+    assert half_life["level"] == "subject"
+    assert (
+        half_life["clips"][0]["value"]
+        == half_life["clips"][1]["value"]
+        < half_life["clips"][2]["value"]
+    )
 
 
 def test_a_subject_is_crossed_with_others_and_with_its_own_other_clips():
@@ -114,18 +118,18 @@ def test_a_subject_is_crossed_with_others_and_with_its_own_other_clips():
 
 def test_subjects_are_measured_with_parameters_that_others_gave(fitted):
     own = float(parameter_tree.get(jaxik.presets.record(), "pelvis.half_life"))
-    gains = np.array(MEASURED)[:, 0]
-    expected = {  # the clips are raised by the gain, and captured near to the animation
+    half_lives = np.array(MEASURED)[:, 0]
+    expected = {  # the clips are raised by the half_life, and captured near to the animation
         ("ann", population.NOTHING): [own, own],
-        ("ann", population.OWN): gains[[1, 0]],
-        ("ann", population.OTHERS): gains[[2, 2]],
-        ("ann", population.ALL): [gains[1:].mean(), gains[[0, 2]].mean()],
+        ("ann", population.OWN): half_lives[[1, 0]],
+        ("ann", population.OTHERS): half_lives[[2, 2]],
+        ("ann", population.ALL): [half_lives[1:].mean(), half_lives[[0, 2]].mean()],
         ("ben", population.NOTHING): [own],
-        ("ben", population.OTHERS): [gains[:2].mean()],
+        ("ben", population.OTHERS): [half_lives[:2].mean()],
     }
     rows = {(row.subject, row.fitted_on): row.accuracy.pelvis for row in fitted.crossed}
     assert rows.keys() == expected.keys()
-    below = rows["ben", population.OTHERS] - gains[:2].mean()  # the capture of the last clip
+    below = rows["ben", population.OTHERS] - half_lives[:2].mean()  # the capture of the last clip
     for key, raised in expected.items():
         near = below if key[0] == "ben" else 0.0
         rms = np.sqrt(np.mean(np.square(np.asarray(raised) + near)))
@@ -224,7 +228,7 @@ def test_the_folder_has_a_report_and_parameters(made):
     page = Page(out / pages.PAGE)
     assert "too few to say much of spreads: pelvis.half_life differs between them." in page.text
     assert "All 7 searches and the fit of the population converged." in page.text
-    assert "ann other subjects 30." in page.text
+    assert re.search(r"ann other subjects (29\.[5-9]|30\.[0-5])", page.text)  # cm: of ben
     assert re.search(r"all clips \d+\.\d+ 2 of 2 ", page.text)
     assert page.elements.count("img") == 1 and "uneven_walk from 1 s (ann)" in page.text
     numbers = json.loads((out / "population.json").read_text())
@@ -255,16 +259,16 @@ def test_what_has_not_converged_is_said_and_ends_with_status_3(
 
 
 def test_the_summary_says_whether_clips_differ_as_far_as_that_is_known(fitted):
-    gain, pitch = fitted.parameters
+    half_life, pitch = fitted.parameters
     for spread, text in (
-        (gain["spread"], "`pelvis.half_life` differs between clips: spread "),
+        (half_life["spread"], "`pelvis.half_life` differs between clips: spread "),
         ({"value": 0.2, "interval": [0.0, 1.5]}, "spread 0.2, at most 1.5, from 3 clips only."),
         (
             {"value": 0.0, "interval": [0.0, 0.7]},
             "is alike in all clips as far as they tell: spread at most 0.7",
         ),
     ):
-        changed = dataclasses.replace(fitted, parameters=[{**gain, "spread": spread}, pitch])
+        changed = dataclasses.replace(fitted, parameters=[{**half_life, "spread": spread}, pitch])
         brief = document.text(population.document(changed))
         assert text in brief.rpartition("\n\n- ")[2]
 

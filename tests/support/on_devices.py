@@ -88,8 +88,8 @@ def evaluations(*kinds: str) -> dict[str, np.ndarray]:
     ik = problem.space.unpack(problem.space.start)
     found = {}
     for kind in kinds or ("systems", "clips"):
-        gains = np.linspace(0.05, 0.9, SYSTEMS) if kind == "systems" else [0.2]
-        batch = fitting.vary(ik, {"pelvis.half_life": gains})
+        half_lives = np.linspace(0.05, 0.9, SYSTEMS) if kind == "systems" else [0.2]
+        batch = fitting.vary(ik, {"pelvis.half_life": half_lives})
         chunk = CHUNK if kind == "systems" else 2
         values = fitting.evaluate_many(batch, problem.data, chunk=chunk)
         found |= {f"{kind} {name}": value for name, value in values.items()}
