@@ -198,8 +198,9 @@ class Measures(Figures):
     pop: float = declared(
         "pop", "cm in 1/60 s", 1,
         "Largest change, over 1/60 s, of a correction: of the pelvis's height, or of an ankle's "
-        "place relative to the pelvis, each less that of the animated one. Where frames are "
-        "longer, the change over a frame is scaled to 1/60 s.",
+        "place relative to the pelvis, each less that of the animated one, whose strides are those "
+        "of its speed and direction. Where frames are longer, the change over a frame is scaled to "
+        "1/60 s.",
         bound=VISIBLE,
         reason="larger changes are seen, beyond what a smooth swing from one foothold to the next "
         "needs on this ground",
@@ -341,7 +342,8 @@ def place(
 
     Args:
         solved: the motion.
-        animated: the animation from which it was made, with its root where the motion has it.
+        animated: the animation from which it was made, with its root where the motion has it, and
+            strides scaled and turned for that.
         flat: the animation on its own floor, with its root at the speed at which it steps.
         terrain: y up.
         floor: height of that floor, m.

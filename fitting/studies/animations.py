@@ -209,8 +209,18 @@ class Animation:
             result: of the system that made it; None leaves unknown which targets are reached.
         """
         reached = None if result is None else self.reached(result)
-        own = self.own_speed
-        return measures.place(solved, self.placed_clip, own, self.terrain, self.floor, reached)
+        animated = self.placed_clip if result is None else self._warped(result)
+        return measures.place(solved, animated, self.own_speed, self.terrain, self.floor, reached)
+
+    def _warped(self, result: jaxik.Result) -> Clip:
+        """The placed clip with its ankles where another speed or direction takes them."""
+        clip = self.placed_clip
+        if not has_other_path(self) or self.carried is not None:
+            return clip
+        sensed, positions_ws = stage_outputs(result).sensed, clip.positions_ws.copy()
+        ankles = [joints[2] for joints in clip.rig.joints]
+        positions_ws[:, ankles] = sensed.ankle_ws - np.asarray(sensed.root_ws)[:, None]
+        return clip.with_motion(positions_ws, clip.rotations_ws)
 
     def cause(
         self, motion: measures.PlacedMotion, ik: jaxik.FootIK | None = None

@@ -29,6 +29,7 @@ from fitting.synthetic import walker
 from fitting.synthetic.walker import WalkStyle
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from stairs.walks import stepping
 from support import comparisons
 from support.commands import refusal
 from support.experiments import ROOT
@@ -248,6 +249,28 @@ def test_poses_that_are_not_finite_name_their_system_and_are_not_written(folder,
 def test_presets_that_leave_heights_to_their_game_stand_on_the_ground_by_default():
     systems = comparison.named_systems([("--presets", "mec,ozz,unreal")])
     assert all(parameter_tree.get(ik, "root.enabled") for ik in systems.values())
+
+
+# Another speed or direction
+
+
+@pytest.mark.parametrize(("speed", "direction"), [(0.6, 0.0), (1.0, 1.0)])
+def test_strides_of_another_speed_or_direction_are_no_pops(speed, direction, tmp_path):
+    clips.save_clip(tmp_path / "walk.npz", stepping(0.6))
+    corners = np.array([[-20.0, 0.0, -20.0], [-20, 0, 20], [20, 0, 20], [20, 0, -20]])
+    meshes.save_mesh(tmp_path / "floor.ply", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    files = animations.AnimationFiles(
+        tmp_path / "walk.npz", tmp_path / "floor.ply", speed=speed, direction=direction
+    )
+    animation = animations.load_animation(files)
+    result, solved = animation.solve(preset_system("stride"))
+    assert animation.place(solved, result).measures.pop < 0.005
+    assert animation.place(solved).measures.pop > measures.VISIBLE, "off the animation itself"
+    jump = np.where(np.arange(len(solved.positions_ws)) < 60, 0.0, 0.05)
+    raised = solved.positions_ws.copy()
+    raised[:, solved.rig.joints[0][2], 1] += jump
+    jumping = solved.with_motion(raised, solved.rotations_ws)
+    assert animation.place(jumping, result).measures.pop > 0.04
 
 
 # Frame rates
