@@ -254,16 +254,16 @@ def test_presets_that_leave_heights_to_their_game_stand_on_the_ground_by_default
 # Another speed or direction
 
 
-@pytest.mark.parametrize(("speed", "direction"), [(0.6, 0.0), (1.0, 1.0)])
-def test_strides_of_another_speed_or_direction_are_no_pops(speed, direction, tmp_path):
+def test_strides_of_another_speed_and_direction_are_no_pops(tmp_path):
     clips.save_clip(tmp_path / "walk.npz", stepping(0.6))
     corners = np.array([[-20.0, 0.0, -20.0], [-20, 0, 20], [20, 0, 20], [20, 0, -20]])
     meshes.save_mesh(tmp_path / "floor.ply", corners, np.array([[0, 1, 2], [0, 2, 3]]))
     files = animations.AnimationFiles(
-        tmp_path / "walk.npz", tmp_path / "floor.ply", speed=speed, direction=direction
+        tmp_path / "walk.npz", tmp_path / "floor.ply", speed=0.6, direction=1.0
     )
     animation = animations.load_animation(files)
-    result, solved = animation.solve(preset_system("stride"))
+    ik = preset_system("record", faithful=True)  # compiles sooner than others
+    result, solved = animation.solve(parameter_tree.replace(ik, {"lock.enabled": False}))
     assert animation.place(solved, result).measures.pop < 0.005
     assert animation.place(solved).measures.pop > measures.VISIBLE, "off the animation itself"
     jump = np.where(np.arange(len(solved.positions_ws)) < 60, 0.0, 0.05)
