@@ -52,12 +52,12 @@ GAINS = {"low": 0.01, "high": 0.95}  # between which gains were fitted, likewise
 
 def parameters_with_half_lives(values: Table, leaves: Collection[str]) -> Content:
     """Values by dotted name, where a system with these leaves has half-lives, s, for gains."""
+    rates = {_tick_rate(gain) for gain in HALF_LIVES if _is_gain(gain, leaves)} - {*leaves}
     content: Content = {}
     for name, value in values.items():
-        tick = f"{name.partition('.')[0]}.tick_hz"
         if _is_gain(name, leaves):
-            content[HALF_LIVES[name]] = _half_life(value, values.get(tick, TICK_HZ))
-        elif name != tick or tick in leaves:
+            content[HALF_LIVES[name]] = _half_life(value, values.get(_tick_rate(name), TICK_HZ))
+        elif name not in rates:
             content[name] = value
     return content
 
@@ -86,6 +86,11 @@ def row_with_half_life(row: Table) -> Table:
 def _is_gain(name: str, leaves: Collection[str]) -> bool:
     """Whether a system with these leaves has a half-life in place of a gain of this name."""
     return name not in leaves and HALF_LIVES.get(name) in leaves
+
+
+def _tick_rate(gain: str) -> str:
+    """The name of the tick rate to which a gain of this name refers."""
+    return f"{gain.partition('.')[0]}.tick_hz"
 
 
 def _half_life(gain: Any, tick_hz: Any = TICK_HZ) -> Any:

@@ -77,6 +77,8 @@ def test_gains_of_an_earlier_release_are_half_lives(tmp_path):
         ("pelvis.on_gain = nan", "pelvis.half_life is nan; wanted a number"),
         ("pelvis.on_gain = true", "pelvis.half_life is True; wanted a number"),
         ("preset = 'stride'\npelvis.on_gain = 0.1", "unknown key 'pelvis.on_gain'"),
+        ("preset = 'stride'\npelvis.tick_hz = 60.0", "unknown key 'pelvis.tick_hz'"),
+        ("leg.tick_hz = 60.0", "unknown key 'leg.tick_hz'"),
     ):
         with pytest.raises(ValueError, match=message):
             parameter_files.load_system(write_file(tmp_path, text))

@@ -36,9 +36,7 @@ RING = tuple(  # forward and right of the rays that look for support around a fo
 SUPPORT_FADE = 0.25  # of the ring, over which ground becomes too narrow
 SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
 SAME_GROUND = 1e-3  # m, between hits of one surface at most
-HOLLOW = (
-    0.02  # m, depth up to which ground between two others is uneven, and over which it is a gap
-)
+HOLLOW = 0.02  # m, depth up to which ground between two others is uneven; as much more is a gap
 
 
 class AbstractProbe(Rule):
